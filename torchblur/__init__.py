@@ -1,0 +1,1 @@
+"""torchblur: differentiable, batched motion-blur filters in PyTorch."""

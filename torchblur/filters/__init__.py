@@ -1,0 +1,14 @@
+"""Published motion-blur filters, one file each: a function, a Module and its config.
+
+Every module of this package is imported here, so that a new file registers its filter by itself.
+"""
+
+from importlib import import_module
+from pkgutil import iter_modules
+
+from torchblur.filters.base import BlurFilter, FilterConfig, get_filter, registered_filters
+
+for _module in iter_modules(__path__):
+    import_module(f"{__name__}.{_module.name}")
+
+__all__ = ["BlurFilter", "FilterConfig", "get_filter", "registered_filters"]

@@ -1,0 +1,353 @@
+"""The tensors of a frame, and the conventions that all of torchblur agrees on.
+
+======================  ==========================================================================
+tensors                 float32, NCHW, batch first; float64 for gradient checks
+color                   (B, 3, H, W) scene-linear radiance, not tone-mapped
+depth                   (B, 1, H, W) positive distance along the view axis, larger is farther;
+                        the background is a large finite value or +inf
+velocity                (B, 2, H, W) screen displacement in **pixels per frame, forward in time,
+                        x right, y down**; the full displacement, not half of it
+shutter                 open time as a fraction of a frame, and its position. Half spread of a
+                        centered shutter: ``V = shutter * velocity / 2``
+pixel centers           pixel (x, y) has its center at (x + 1/2, y + 1/2): `align_corners=False`
+borders                 replicate
+======================  ==========================================================================
+
+Other programs' units, signs and axes are converted where files are read (`torchblur.io`), never
+in a filter. `tests/test_conventions.py` executes this table.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import warnings
+from collections.abc import Callable, Sequence
+from dataclasses import InitVar, dataclass
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+from torchblur.errors import FrameError
+
+__all__ = ["FAR_DEPTH", "Frame", "Shutter", "ShutterPosition"]
+
+ShutterPosition = Literal["centered", "leading", "trailing"]
+
+FAR_DEPTH = 1e10
+"""Depth that stands for the background in arithmetic, scene units; +inf is replaced by it."""
+
+_CHANNELS = {
+    "color": 3,
+    "depth": 1,
+    "velocity": 2,
+    "normal": 3,
+    "object_id": 1,
+    "time": 1,
+    "acceleration": 2,
+    "valid": 1,
+}
+_FINITE = ("color", "velocity", "normal", "time", "acceleration")
+
+
+@dataclass(frozen=True)
+class Shutter:
+    """When the shutter is open, relative to the frame's own time 0.
+
+    Args:
+        open: Open time as a fraction of a frame, in [0, 2]; 0.5 is a 180 degree shutter.
+        position: "centered": open in [-open/2, open/2]. "leading": opens at the frame,
+            [0, open]. "trailing": closes at the frame, [-open, 0].
+
+    Raises:
+        FrameError: if `open` is outside [0, 2] or the position has another name.
+    """
+
+    open: float = 0.5
+    position: ShutterPosition = "centered"
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.open <= 2:
+            raise FrameError(f"`open` must lie in [0, 2] frames, got {self.open}")
+        if self.position not in ("centered", "leading", "trailing"):
+            raise FrameError(
+                "`position` must be 'centered', 'leading' or 'trailing', "
+                f"got {self.position!r}"
+            )
+
+    @classmethod
+    def from_angle(cls, degrees: float, position: ShutterPosition = "centered") -> Shutter:
+        """Make a shutter from its angle: 180 degrees are half a frame."""
+        return cls(degrees / 360, position)
+
+    @property
+    def interval(self) -> tuple[float, float]:
+        """Opening and closing time, in frames, relative to the frame."""
+        start = (self.center - 1) * self.open / 2
+        return start, start + self.open
+
+    @property
+    def center(self) -> int:
+        """Middle of the open interval in units of half its length: 0, +1 leading, -1 trailing."""
+        return {"centered": 0, "leading": 1, "trailing": -1}[self.position]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Frame:
+    """One batch of frames: color, depth, velocity and optional layers, checked on construction.
+
+    A tensor with three dimensions gets a batch dimension. All layers have one size, one device,
+    and (but for `object_id` and `valid`) one floating type.
+
+    Args:
+        color: Scene-linear radiance, (B, 3, H, W).
+        velocity: Displacement in px/frame, forward in time, x right, y down, (B, 2, H, W).
+        depth: Positive distance along the view axis in scene units, (B, 1, H, W); +inf allowed.
+        normal: Surface normals, (B, 3, H, W).
+        object_id: Integer object numbers, (B, 1, H, W).
+        time: Time of each pixel's sample over the shutter, 0 opening, 1 closing, (B, 1, H, W).
+        acceleration: Change of velocity, px/frame², (B, 2, H, W).
+        revealed: A second frame: what lies behind the moving objects.
+        valid: Pixels that can be trusted, bool, (B, 1, H, W).
+        source: Where the data came from (a file name); it is named in errors.
+        on_invalid: "raise" refuses NaN and inf; "mask" replaces them (color and velocity by 0,
+            depth by +inf), marks those pixels in `valid`, and warns how many there are.
+
+    Raises:
+        FrameError: wrong shape, mixed sizes, types or devices, NaN or inf in color or velocity,
+            NaN or a value not above 0 in depth; with layer, count, first position and source.
+    """
+
+    color: Tensor
+    velocity: Tensor
+    depth: Tensor | None = None
+    normal: Tensor | None = None
+    object_id: Tensor | None = None
+    time: Tensor | None = None
+    acceleration: Tensor | None = None
+    revealed: Frame | None = None
+    valid: Tensor | None = None
+    source: str = ""
+    on_invalid: InitVar[Literal["raise", "mask"]] = "raise"
+
+    def __post_init__(self, on_invalid: Literal["raise", "mask"]) -> None:
+        if on_invalid not in ("raise", "mask"):
+            raise FrameError(f"`on_invalid` must be 'raise' or 'mask', got {on_invalid!r}")
+        for name in _CHANNELS:
+            layer = getattr(self, name)
+            if layer is not None:
+                self._set(name, self._shaped(name, layer))
+        self._check_agreement()
+        self._check_values(on_invalid)
+
+    # -- sizes ---------------------------------------------------------------------------------
+
+    @property
+    def batch_size(self) -> int:
+        """Number of frames in the batch, B."""
+        return self.color.shape[0]
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Height and width in pixels."""
+        return self.color.shape[2], self.color.shape[3]
+
+    @property
+    def dtype(self) -> torch.dtype:
+        """Floating type of the color."""
+        return self.color.dtype
+
+    @property
+    def device(self) -> torch.device:
+        """Device of all layers."""
+        return self.color.device
+
+    # -- what filters ask for ------------------------------------------------------------------
+
+    def finite_depth(self) -> Tensor:
+        """Return the depth with the background at most `FAR_DEPTH`, (B, 1, H, W).
+
+        Differentiable: yes; zero gradient at the background.
+
+        Raises:
+            FrameError: if the frame has no depth.
+        """
+        depth = self.require("depth")
+        return depth.clamp(max=min(FAR_DEPTH, torch.finfo(depth.dtype).max / 4))
+
+    def require(self, name: str) -> Tensor:
+        """Return a layer, or refuse with the names of those that are there.
+
+        Raises:
+            FrameError: if the layer is missing.
+        """
+        layer = getattr(self, name)
+        if layer is None:
+            raise FrameError(
+                f"the layer `{name}` is needed and is missing{self._place()}; "
+                f"present: {', '.join(self.layers())}"
+            )
+        return layer  # type: ignore[no-any-return]
+
+    def layers(self) -> dict[str, Tensor]:
+        """Return the tensors that are present, by name (without `revealed`)."""
+        return {name: t for name in _CHANNELS if (t := getattr(self, name)) is not None}
+
+    # -- other frames --------------------------------------------------------------------------
+
+    def map(self, function: Callable[[Tensor], Tensor]) -> Frame:
+        """Return the frame with a function applied to each layer, `revealed` included.
+
+        Args:
+            function: Takes and returns one layer; it must treat all of them alike (a crop, a
+                move to a device), as values are not converted.
+        """
+        # The values were checked when the frame was made; checking again would cost a pass.
+        frame = object.__new__(Frame)
+        for field in dataclasses.fields(self):
+            value = getattr(self, field.name)
+            if isinstance(value, Tensor):
+                value = function(value)
+            elif isinstance(value, Frame):
+                value = value.map(function)
+            object.__setattr__(frame, field.name, value)
+        return frame
+
+    def to(
+        self, device: torch.device | str | None = None, dtype: torch.dtype | None = None
+    ) -> Frame:
+        """Return the frame on another device and, for floating layers, of another type."""
+        return self.map(
+            lambda t: t.to(device=device, dtype=dtype if t.is_floating_point() else None)
+        )
+
+    def crop(self, top: int, left: int, height: int, width: int) -> Frame:
+        """Return a window of the frame; positions and sizes in px.
+
+        Raises:
+            FrameError: if the window does not lie within the frame.
+        """
+        rows, columns = self.size
+        if min(top, left) < 0 or min(height, width) < 1 or top + height > rows \
+                or left + width > columns:
+            raise FrameError(
+                f"a window must lie within the frame of {columns}x{rows}, got "
+                f"{width}x{height} at ({left}, {top}){self._place()}"
+            )
+        return self.map(lambda t: t[..., top : top + height, left : left + width])
+
+    def expand(self, batch_size: int) -> Frame:
+        """Return a frame of one repeated to a batch, without a copy.
+
+        Raises:
+            FrameError: if the frame is a batch of another size already.
+        """
+        if self.batch_size not in (1, batch_size):
+            raise FrameError(
+                f"a batch of {self.batch_size} cannot be expanded to {batch_size}{self._place()}"
+            )
+        return self.map(lambda t: t.expand(batch_size, -1, -1, -1))
+
+    @staticmethod
+    def stack(frames: Sequence[Frame]) -> Frame:
+        """Join frames of one size into a batch; layers that not all of them have are left out.
+
+        Raises:
+            FrameError: if there is no frame, or the sizes differ.
+        """
+        if not frames:
+            raise FrameError("a batch needs at least one frame, got none")
+        sizes = {frame.size for frame in frames}
+        if len(sizes) > 1:
+            names = ", ".join(f"{w}x{h}" for h, w in sorted(sizes))
+            raise FrameError(f"the frames of a batch must have one size, got {names}")
+        common = [n for n in _CHANNELS if all(getattr(f, n) is not None for f in frames)]
+        layers = {name: torch.cat([getattr(f, name) for f in frames]) for name in common}
+        revealed = [f.revealed for f in frames if f.revealed is not None]
+        return Frame(
+            **layers,
+            revealed=Frame.stack(revealed) if len(revealed) == len(frames) else None,
+            source=", ".join(f.source for f in frames if f.source),
+        )
+
+    # -- checks --------------------------------------------------------------------------------
+
+    def _set(self, name: str, value: Tensor) -> None:
+        object.__setattr__(self, name, value)
+
+    def _place(self) -> str:
+        return f" ({self.source})" if self.source else ""
+
+    def _shaped(self, name: str, layer: Tensor) -> Tensor:
+        if not isinstance(layer, Tensor):
+            raise FrameError(f"`{name}` must be a tensor, got {type(layer).__name__}")
+        if layer.ndim == 3:
+            layer = layer[None]
+        channels = _CHANNELS[name]
+        if layer.ndim != 4 or layer.shape[1] != channels or 0 in layer.shape:
+            raise FrameError(
+                f"`{name}` must have shape (B, {channels}, H, W), got "
+                f"{tuple(layer.shape)}{self._place()}"
+            )
+        if name not in ("object_id", "valid") and not layer.is_floating_point():
+            raise FrameError(f"`{name}` must be floating point, got {layer.dtype}{self._place()}")
+        return layer
+
+    def _check_agreement(self) -> None:
+        for name, layer in self.layers().items():
+            for what, got, want in (
+                ("batch and size", _batch_and_size(layer), _batch_and_size(self.color)),
+                ("device", layer.device, self.device),
+                ("type", layer.dtype, self.dtype),
+            ):
+                if what == "type" and name in ("object_id", "valid"):
+                    continue
+                if got != want:
+                    raise FrameError(
+                        f"all layers must have one {what}: `color` has {want}, "
+                        f"`{name}` has {got}{self._place()}"
+                    )
+        if self.revealed is not None and self.revealed.size != self.size:
+            raise FrameError(
+                f"`revealed` must have the size of the frame, {self.size}, "
+                f"got {self.revealed.size}{self._place()}"
+            )
+
+    def _check_values(self, on_invalid: str) -> None:
+        bad_pixels = torch.zeros_like(self.color[:, :1], dtype=torch.bool)
+        for name in _FINITE:
+            layer = getattr(self, name)
+            if layer is not None:
+                bad = ~torch.isfinite(layer)
+                bad_pixels |= self._handle(name, layer, bad, on_invalid, "be finite", 0.0)
+        if self.depth is not None:
+            bad = ~(self.depth > 0)
+            rule = "be a positive distance (or +inf)"
+            bad_pixels |= self._handle("depth", self.depth, bad, on_invalid, rule, math.inf)
+        if bool(bad_pixels.any()):
+            valid = ~bad_pixels if self.valid is None else self.valid.bool() & ~bad_pixels
+            self._set("valid", valid)
+
+    def _handle(
+        self, name: str, layer: Tensor, bad: Tensor, on_invalid: str, rule: str, filler: float
+    ) -> Tensor:
+        """Refuse or replace bad values; return the bad pixels, (B, 1, H, W)."""
+        pixels = bad.any(dim=1, keepdim=True)
+        if not bool(pixels.any()):
+            return pixels
+        b, c, y, x = (int(i) for i in bad.nonzero()[0])
+        text = (
+            f"`{name}` must {rule}, got {int(bad.sum())} values that are not, the first "
+            f"{float(layer[b, c, y, x])} in channel {c} at x={x}, y={y} of frame {b}"
+            f"{self._place()}"
+        )
+        if on_invalid == "raise":
+            raise FrameError(f'{text}; on_invalid="mask" replaces them')
+        warnings.warn(f"{text}; replaced by {filler:g} and masked", stacklevel=5)
+        self._set(name, torch.where(bad, torch.full_like(layer, filler), layer))
+        return pixels
+
+
+def _batch_and_size(layer: Tensor) -> tuple[int, int, int]:
+    return layer.shape[0], layer.shape[2], layer.shape[3]
