@@ -72,8 +72,7 @@ class Shutter:
             raise FrameError(f"`open` must lie in [0, 2] frames, got {self.open}")
         if self.position not in ("centered", "leading", "trailing"):
             raise FrameError(
-                "`position` must be 'centered', 'leading' or 'trailing', "
-                f"got {self.position!r}"
+                f"`position` must be 'centered', 'leading' or 'trailing', got {self.position!r}"
             )
 
     @classmethod
@@ -229,8 +228,12 @@ class Frame:
             FrameError: if the window does not lie within the frame.
         """
         rows, columns = self.size
-        if min(top, left) < 0 or min(height, width) < 1 or top + height > rows \
-                or left + width > columns:
+        if (
+            min(top, left) < 0
+            or min(height, width) < 1
+            or top + height > rows
+            or left + width > columns
+        ):
             raise FrameError(
                 f"a window must lie within the frame of {columns}x{rows}, got "
                 f"{width}x{height} at ({left}, {top}){self._place()}"
@@ -266,7 +269,7 @@ class Frame:
         layers = {name: torch.cat([getattr(f, name) for f in frames]) for name in common}
         revealed = [f.revealed for f in frames if f.revealed is not None]
         return Frame(
-            **layers,
+            **layers,  # type: ignore[arg-type]
             revealed=Frame.stack(revealed) if len(revealed) == len(frames) else None,
             source=", ".join(f.source for f in frames if f.source),
         )

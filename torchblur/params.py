@@ -19,8 +19,13 @@ from dataclasses import dataclass
 from typing import Any, Literal, TypeVar, get_args
 
 import torch
-from pydantic import BaseModel, ConfigDict, GetCoreSchemaHandler, GetJsonSchemaHandler
-from pydantic import ValidationError
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    GetCoreSchemaHandler,
+    GetJsonSchemaHandler,
+    ValidationError,
+)
 from pydantic_core import CoreSchema, PydanticCustomError, core_schema
 from torch import Tensor
 
@@ -132,9 +137,7 @@ class Param:
         if self.low is None:
             return core_schema.bool_schema(strict=True) if source is bool else handler(source)
         number = core_schema.int_schema if source is int else core_schema.float_schema
-        return core_schema.with_info_after_validator_function(
-            self._validate, number(strict=True)
-        )
+        return core_schema.with_info_after_validator_function(self._validate, number(strict=True))
 
     def _validate(self, value: float, info: core_schema.ValidationInfo) -> float:
         try:
@@ -245,13 +248,19 @@ def _valid_keys(model: type[BaseModel], loc: tuple[int | str, ...]) -> list[str]
     """Return the keys that are valid at a place, as far as the models tell."""
     candidates: list[Any] = [model]
     for part in loc:
-        inside = [_models_in(c.model_fields[part].annotation) for c in candidates
-                  if part in c.model_fields]
+        inside = [
+            _models_in(c.model_fields[part].annotation)
+            for c in candidates
+            if part in c.model_fields
+        ]
         if inside:
             candidates = [m for models in inside for m in models]
         elif isinstance(part, str):  # the tag of a union: keep the member that it names
-            candidates = [c for c in candidates
-                          if any(part in get_args(f.annotation) for f in c.model_fields.values())]
+            candidates = [
+                c
+                for c in candidates
+                if any(part in get_args(f.annotation) for f in c.model_fields.values())
+            ]
     return [key for c in candidates for key in c.model_fields]
 
 

@@ -29,7 +29,11 @@ class FilterConfig(Config):
     shutter: Annotated[
         float,
         Param(
-            symbol="E", unit="frame", low=0.0, high=2.0, grad="weak",
+            symbol="E",
+            unit="frame",
+            low=0.0,
+            high=2.0,
+            grad="weak",
             source="180 degree shutter = 0.5",
             meaning="open time of the shutter as a fraction of a frame; the strength of the blur",
         ),
@@ -37,7 +41,8 @@ class FilterConfig(Config):
     shutter_position: Annotated[
         ShutterPosition,
         Param(
-            grad="discrete", source="torchblur",
+            grad="discrete",
+            source="torchblur",
             meaning="open around the frame's time, after it (leading) or before it (trailing)",
         ),
     ] = "centered"
@@ -184,9 +189,7 @@ class BlurFilter(nn.Module):
     def extra_repr(self) -> str:
         """Show the parameters that differ from the defaults, so that `repr` evaluates back."""
         default = self.config_class()
-        changed = {
-            k: v for k, v in self.config.model_dump().items() if v != getattr(default, k)
-        }
+        changed = {k: v for k, v in self.config.model_dump().items() if v != getattr(default, k)}
         return ", ".join(f"{key}={value!r}" for key, value in changed.items())
 
 

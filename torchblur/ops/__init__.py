@@ -1,0 +1,1 @@
+"""Pure tensor functions: gather, tiles, weights, noise, velocity, color."""

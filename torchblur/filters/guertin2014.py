@@ -1,0 +1,378 @@
+"""Guertin 2014: a fast and stable feature-aware motion blur filter."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Literal, NamedTuple
+
+import torch
+from torch import Tensor
+
+from torchblur.filters.base import BlurFilter, Values
+from torchblur.filters.reconstruction import (
+    ReconstructionConfig,
+    Spread,
+    Tap,
+    resolve,
+    sample,
+    spread_of,
+    texture_of,
+)
+from torchblur.frame import Frame, Shutter
+from torchblur.ops.color import luma
+from torchblur.ops.gather import Engine, Inputs, Lookup, gather, pixel_grid
+from torchblur.ops.noise import checkerboard, noise_plane
+from torchblur.ops.tiles import neighbor_max, tile_lookup, tile_max, tile_offset, tile_variance
+from torchblur.ops.velocity import direction, length, quantize_uint8
+from torchblur.ops.weights import cone, cylinder, depth_weights, power, saturate
+from torchblur.params import Param
+
+__all__ = ["Guertin2014Blur", "Guertin2014Config", "guertin2014"]
+
+_SETTINGS = "Guertin 2014, section 5"
+_GOLDEN = 0.6180339887498949  # spreads the taps of one direction evenly over the others
+
+
+# fmt: off
+class Guertin2014Config(ReconstructionConfig):
+    """Parameters of Guertin 2014; the defaults are the paper's."""
+
+    num_samples: Annotated[
+        int,
+        Param(symbol="N", unit="taps", low=1, high=512, scale="log", grad="discrete",
+              source=_SETTINGS, meaning="taps of the gather, over both directions"),
+    ] = 35
+    tile_size: Annotated[
+        int,
+        Param(symbol="r", unit="px", low=1, high=512, scale="log", grad="discrete",
+              source=_SETTINGS,
+              meaning="edge of a tile, and the longest half spread that is blurred"),
+    ] = 40
+    tau: Annotated[
+        float,
+        Param(symbol="τ", low=0.0, high=2.0, grad="weak", source="Guertin 2014, section 4.2",
+              meaning="how far the tile lookup may stray over the tile's edge"),
+    ] = 1.0
+    kappa: Annotated[
+        float,
+        Param(symbol="κ", low=1.0, high=1000.0, scale="log", grad="smooth",
+              source="Guertin 2014, section 4.3",
+              meaning="the pixel's own weight is N / (κ · half spread): larger blurs more"),
+    ] = 40.0
+    eta: Annotated[
+        float,
+        Param(symbol="η", unit="taps", low=0.0, high=2.0, grad="weak",
+              source="Guertin 2014, section 4.5", meaning="largest jitter of a pixel's taps"),
+    ] = 0.95
+    gamma: Annotated[
+        float,
+        Param(symbol="γ", unit="px", low=0.05, high=20.0, scale="log", grad="weak",
+              source="Guertin 2014, section 4.1, eq. 1",
+              meaning="half spread above the least at which the center direction is the pixel's"),
+    ] = 1.5
+    phi: Annotated[
+        float,
+        Param(symbol="φ", unit="taps", low=0.0, high=200.0, grad="weak",
+              source="Guertin 2014, section 4.5", meaning="the jitter is scaled by φ / N"),
+    ] = 27.0
+    direction_exponent: Annotated[
+        float,
+        Param(low=0.1, high=16.0, scale="log", grad="smooth",
+              source="1 in Guertin 2014, section 4.1; 3 in the 2025 notes",
+              meaning="exponent of the direction weights"),
+    ] = 1.0
+    relative_depth_extent: Annotated[
+        float,
+        Param(symbol="λ", low=1e-3, high=10.0, scale="log", grad="smooth",
+              source="Guertin 2014, section 5 (zCompare); 1 is the paper's",
+              meaning="depth difference, relative to the nearer depth, that tells front from back"),
+    ] = 1.0
+    soft_depth_extent: Annotated[
+        float,
+        Param(unit="scene units", low=1e-4, high=1e4, scale="log", grad="smooth",
+              source="McGuire 2012, section 3.3",
+              meaning='the same for depth_compare="absolute", as a distance'),
+    ] = 0.1
+    directions: Annotated[
+        Literal["one", "two"],
+        Param(grad="discrete", source="Guertin 2014, section 4.1",
+              meaning="taps along the tile's direction only, or along the pixel's too"),
+    ] = "two"
+    sample_assignment: Annotated[
+        Literal["even", "variance"],
+        Param(grad="discrete", source="Guertin 2014, section 4.1, eq. 2",
+              meaning="split of the taps: half and half, or by the variance of the tiles"),
+    ] = "even"
+    direction_weights: Annotated[
+        bool,
+        Param(grad="discrete", source="Guertin 2014, section 4.1",
+              meaning="weight taps by how well velocity and sampling direction agree"),
+    ] = True
+    own_direction_against: Annotated[
+        Literal["tap", "tile"],
+        Param(grad="discrete", source="pseudocode (tap) against text (tile) of Guertin 2014",
+              meaning="what the pixel's direction is compared with in the second weight"),
+    ] = "tap"
+    tap_length: Annotated[
+        Literal["tile", "own"],
+        Param(grad="discrete", source="tile: Guertin 2014; own: Blender's EEVEE",
+              meaning="reach of the taps along the pixel's direction: the tile's, or its own"),
+    ] = "tile"
+    stochastic_tiles: Annotated[
+        bool,
+        Param(grad="discrete", source="Guertin 2014, section 4.2",
+              meaning="jitter the tile lookup near the edges of tiles"),
+    ] = True
+    neighbor_culling: Annotated[
+        bool,
+        Param(grad="discrete", source="Guertin 2014, section 4.4",
+              meaning="a diagonal tile counts only if its motion can reach the middle one"),
+    ] = True
+    center_weight: Annotated[
+        bool,
+        Param(grad="discrete", source="Guertin 2014, section 4.3",
+              meaning="give the pixel's own color the weight N / (κ · half spread)"),
+    ] = True
+    depth_compare: Annotated[
+        Literal["relative", "absolute"],
+        Param(grad="discrete", source="Guertin 2014, section 5; McGuire 2012",
+              meaning="depth differences relative to the nearer depth, or in scene units"),
+    ] = "relative"
+    velocity_encoding: Annotated[
+        Literal["float", "uint8"],
+        Param(grad="discrete", source="Guertin 2014, section 5",
+              meaning="store velocities and tiles as floats, or in 8 bits as in the paper"),
+    ] = "float"
+    luma: Annotated[
+        Literal["true", "checkerboard"],
+        Param(grad="discrete", source="Guertin 2014, section 4.5",
+              meaning="luma for the anti-aliasing that follows, where there is blur"),
+    ] = "checkerboard"
+# fmt: on
+
+
+class _Options(NamedTuple):
+    center: int
+    two_directions: bool
+    by_variance: bool
+    direction_weights: bool
+    own_length: bool
+    relative_depth: bool
+    softness: float
+    color_lookup: Lookup
+
+
+def guertin2014(frame: Frame, config: Guertin2014Config | None = None, **params: Any) -> Tensor:
+    """Blur with the feature-aware filter of Guertin 2014.
+
+    Taps alternate between the dominant velocity of the neighborhood of tiles (w_n) and the
+    center direction w_c: the pixel's own, or, where that is short, the perpendicular of w_n.
+    The weight of a tap at distance T along direction d is
+
+    ``f · cone(T, ℓ_S) · B + b · cone(T, ℓ_p) · A + 2 · cyl(T, min(ℓ_S, ℓ_p)) · max(A, B)``
+
+    with ``A = |w_c · d|`` and ``B = |û_S · d|``; the pixel itself has the weight N / (κ ℓ_p).
+
+    Args:
+        frame: Color, depth and velocity, (B, ·, H, W).
+        config: Parameters; the paper's if left out.
+        **params: Single parameters over those of `config`.
+
+    Returns:
+        Color, scene-linear, (B, 3, H, W).
+
+    Differentiable: in color, in depth, in the velocity through the weights (not through the
+        positions of nearest lookups), and in every parameter that `torchblur params` calls
+        smooth. Tiles are chosen by a maximum, which has no gradient.
+    Border: replicated.
+    Reference: Guertin, McGuire, Nowrouzezahrai 2014, appendix A. We differ where the text
+        contradicts itself or leaves a gap: the center direction mixes unit vectors and goes to
+        the perpendicular for slow pixels (eq. 1 is reversed); depth comparison has the sign that
+        the text means; both directions are unit vectors and taps on either reach as far as the
+        dominant velocity; products of directions are absolute; positions are rounded, not
+        floored; taps do not leave [-1, 1]; velocities are floats unless asked for in 8 bits.
+    Raises: ConfigError for a bad parameter, FrameError if the frame has no depth.
+    """
+    result: Tensor = Guertin2014Blur(config, **params)(frame)
+    return result
+
+
+class Guertin2014Blur(BlurFilter):
+    """The feature-aware filter of Guertin 2014. See `guertin2014` for the formula.
+
+    `layers` adds "luma" for an anti-aliasing pass (B, 1, H, W), "tile_max" and "neighbor_max"
+    (half spread in px, (B, 2, Ty, Tx)), "tile_variance" ((B, 1, Ty, Tx), if taps are assigned by
+    it) and "weight" (the sum of all weights, (B, 1, H, W)).
+    """
+
+    name = "guertin2014"
+    config_class = Guertin2014Config
+
+    def compute(self, frame: Frame, values: Values) -> dict[str, Tensor]:
+        """Return "color", "luma", "weight" and the tiles."""
+        return _layers(frame, values, self.engine)
+
+
+def _layers(frame: Frame, values: Values, engine: Engine) -> dict[str, Tensor]:
+    spread = spread_of(frame, values)
+    if values.velocity_encoding == "uint8":
+        half = quantize_uint8(spread.half, values.tile_size)
+        spread = Spread(half, length(half), direction(half))
+    tiles = tile_max(spread.half, values.tile_size)
+    layers = {"tile_max": tiles, "neighbor_max": neighbor_max(tiles, cull=values.neighbor_culling)}
+    noise = noise_plane(values.noise, frame.color, 0, values.seed)
+    offset = None
+    if values.stochastic_tiles:
+        shift = noise_plane(values.noise, frame.color, 1, values.seed)
+        offset = tile_offset(frame.color, shift, values.tile_size, values.tau)
+    dominant = tile_lookup(layers["neighbor_max"], frame.color, values.tile_size, offset)
+    inputs = _tap_inputs(frame, spread, dominant, values)
+    inputs["jitter"] = (2 * noise - 1) * values.eta * values.phi / values.num_samples
+    if values.sample_assignment == "variance":
+        layers["tile_variance"] = tile_variance(tiles, _per_image(values.min_length))
+        inputs["variance"] = tile_lookup(
+            layers["tile_variance"], frame.color, values.tile_size, bilinear=True
+        )
+    sums = gather(_tap, _options(values), values.num_samples, inputs, engine)
+    center_weight = values.num_samples / (values.kappa * inputs["length_p"])
+    if not values.center_weight:
+        center_weight = torch.zeros_like(center_weight)
+    moving = inputs["reach"] > values.early_out
+    layers["color"], layers["weight"] = resolve(frame, sums, center_weight, moving)
+    layers["luma"] = _luma(frame, moving, values.luma, layers["color"])
+    return layers
+
+
+def _tap_inputs(frame: Frame, spread: Spread, dominant: Tensor, values: Values) -> Inputs:
+    x, y = pixel_grid(frame.color)
+    w_n = direction(dominant)
+    length_p = torch.maximum(spread.length, values.min_length)
+    w_c = _center_direction(w_n, spread, length_p, values)
+    against_tile = power((w_c * w_n).sum(1, keepdim=True).abs(), values.direction_exponent)
+    inputs = {
+        "texture": texture_of(frame, spread),
+        "x": x,
+        "y": y,
+        "w_n": w_n,
+        "w_c": w_c,
+        "reach": length(dominant),
+        "depth": frame.finite_depth(),
+        "half": spread.half,
+        "length": spread.length,
+        "length_p": length_p,
+        # A for a tap along w_n and along w_c, which is one plane for all taps
+        "own_n": against_tile,
+        "own_c": torch.ones_like(against_tile)
+        if values.own_direction_against == "tap"
+        else against_tile,
+        "extent": values.relative_depth_extent
+        if values.depth_compare == "relative"
+        else values.soft_depth_extent,
+    }
+    for key in (
+        "cone_slope",
+        "cylinder_inner",
+        "cylinder_outer",
+        "foreground_gain",
+        "background_gain",
+        "third_gain",
+        "min_length",
+        "direction_exponent",
+    ):
+        inputs[key] = getattr(values, key)
+    return inputs
+
+
+def _options(values: Values) -> _Options:
+    return _Options(
+        center=Shutter(1, values.shutter_position).center,
+        two_directions=values.directions == "two",
+        by_variance=values.sample_assignment == "variance",
+        direction_weights=values.direction_weights,
+        own_length=values.tap_length == "own",
+        relative_depth=values.depth_compare == "relative",
+        softness=values.softness,
+        color_lookup=values.color_lookup,
+    )
+
+
+def _center_direction(w_n: Tensor, spread: Spread, length_p: Tensor, values: Values) -> Tensor:
+    """Return w_c: the pixel's direction, or the perpendicular of w_n where the pixel is slow."""
+    w_p = torch.cat((-w_n[:, 1:], w_n[:, :1]), 1)
+    against = (w_p * spread.half).sum(1, keepdim=True) < 0
+    w_p = torch.where(against, -w_p, w_p)
+    mix = saturate((length_p - values.min_length) / values.gamma, values.softness)
+    mixed = (1 - mix) * w_p + mix * spread.unit
+    size = length(mixed)
+    return torch.where(size < 1e-6, w_p, mixed / size)
+
+
+def _per_image(value: Tensor) -> Tensor:
+    """Return a parameter without its dependence on the pixel, for use per tile."""
+    return value.mean((-2, -1), keepdim=True) if value.ndim == 4 else value
+
+
+def _luma(frame: Frame, moving: Tensor, kind: str, color: Tensor) -> Tensor:
+    """Return luma for anti-aliasing, in a perceptual encoding (the square root), in [0, 1]."""
+    true = luma(torch.where(moving, color, frame.color).clamp(0, 1)).clamp_min(1e-8).sqrt()
+    if kind == "true":
+        return true
+    return torch.where(moving, checkerboard(true), true)
+
+
+def _tap(index: Tensor, count: Tensor, inputs: Inputs, options: _Options) -> tuple[Tensor, ...]:
+    t = (2 * (index + 1 + inputs["jitter"]) / (count + 1) - 1).clamp(-1, 1)
+    d, reach, own = inputs["w_n"], inputs["reach"], inputs["own_n"]
+    if options.two_directions:
+        along_center = _takes_center_direction(index, inputs, options)
+        d = torch.where(along_center, inputs["w_c"], d)
+        own = torch.where(along_center, inputs["own_c"], own)
+        if options.own_length:
+            reach = torch.where(along_center, inputs["length"], reach)
+    along = (t + options.center) * reach
+    dx, dy = d.split(1, 1)
+    tap = sample(inputs, inputs["x"] - along * dx, inputs["y"] - along * dy, options.color_lookup)
+    weight = _weight(along, d, tap, own, inputs, options)
+    if tap.valid is not None:
+        weight = weight * tap.valid
+    return weight * tap.color, weight
+
+
+def _takes_center_direction(index: Tensor, inputs: Inputs, options: _Options) -> Tensor:
+    if options.by_variance:
+        return torch.remainder((index + 0.5) * _GOLDEN, 1.0) < inputs["variance"]
+    return torch.remainder(index, 2) == 1
+
+
+def _weight(
+    along: Tensor, d: Tensor, tap: Tap, own: Tensor, inputs: Inputs, options: _Options
+) -> Tensor:
+    """Return the sum of the three weights of a tap."""
+    front, behind = depth_weights(
+        inputs["depth"],
+        tap.depth,
+        inputs["extent"],
+        relative=options.relative_depth,
+        softness=options.softness,
+    )
+    dx, dy = d.split(1, 1)
+    length_s, length_p = torch.maximum(tap.length, inputs["min_length"]), inputs["length_p"]
+    toward = tap.unit_x * dx + tap.unit_y * dy
+    distance_s = distance_p = distance = along.abs()
+    if options.center:
+        moved_p = (inputs["half"] * d).sum(1, keepdim=True)
+        distance_s = (along - options.center * tap.length * toward).abs()
+        distance_p = (along - options.center * moved_p).abs()
+        distance = torch.where(length_s <= length_p, distance_s, distance_p)
+    slope, soft = inputs["cone_slope"], options.softness
+    first = inputs["foreground_gain"] * front * cone(distance_s, length_s, slope, soft)
+    second = inputs["background_gain"] * behind * cone(distance_p, length_p, slope, soft)
+    third = inputs["third_gain"] * cylinder(
+        distance,
+        torch.minimum(length_s, length_p),
+        inputs["cylinder_inner"],
+        inputs["cylinder_outer"],
+    )
+    if not options.direction_weights:
+        return first + second + third
+    theirs = power(toward.abs(), inputs["direction_exponent"])
+    return first * theirs + second * own + third * torch.maximum(own, theirs)

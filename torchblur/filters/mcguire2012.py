@@ -1,0 +1,179 @@
+"""McGuire 2012: a reconstruction filter for plausible motion blur."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from torchblur.filters.base import BlurFilter, Values
+from torchblur.filters.reconstruction import (
+    ReconstructionConfig,
+    resolve,
+    sample,
+    spread_of,
+    texture_of,
+)
+from torchblur.frame import Frame, Shutter
+from torchblur.ops.gather import Engine, Inputs, Lookup, gather, pixel_grid
+from torchblur.ops.noise import noise_plane
+from torchblur.ops.tiles import neighbor_max, tile_lookup, tile_max
+from torchblur.ops.velocity import direction, length
+from torchblur.ops.weights import cone, cylinder, depth_weights
+from torchblur.params import Param
+
+__all__ = ["McGuire2012Blur", "McGuire2012Config", "mcguire2012"]
+
+
+# fmt: off
+class McGuire2012Config(ReconstructionConfig):
+    """Parameters of McGuire 2012."""
+
+    soft_depth_extent: Annotated[
+        float,
+        Param(symbol="SOFT_Z_EXTENT", unit="scene units", low=1e-4, high=1e4, scale="log",
+              grad="smooth", source="McGuire 2012, section 3.3",
+              meaning="depth difference over which front and back are told apart"),
+    ] = 0.1
+    center_gain: Annotated[
+        float,
+        Param(low=0.01, high=100.0, scale="log", grad="smooth", source="McGuire 2012, section 3.3",
+              meaning="gain of the pixel's own weight, 1 / half spread"),
+    ] = 1.0
+    jitter: Annotated[
+        float,
+        Param(symbol="j", unit="taps", low=0.0, high=2.0, grad="weak",
+              source="McGuire 2012, section 3.3",
+              meaning="peak to peak amplitude of the shift of a pixel's taps"),
+    ] = 1.0
+    skip_middle_tap: Annotated[
+        bool,
+        Param(grad="discrete", source="McGuire 2012, section 3.3",
+              meaning="leave out the tap nearest to the pixel, which has its own weight"),
+    ] = True
+# fmt: on
+
+
+class _Options(NamedTuple):
+    center: int
+    skip_middle_tap: bool
+    softness: float
+    color_lookup: Lookup
+
+
+def mcguire2012(frame: Frame, config: McGuire2012Config | None = None, **params: Any) -> Tensor:
+    """Blur with the reconstruction filter of McGuire 2012.
+
+    Every tap lies on the dominant velocity of the neighborhood of tiles. Its weight is
+    ``f · cone(T, ℓ_S) + b · cone(T, ℓ_p) + 2 · cyl(T, ℓ_S) · cyl(T, ℓ_p)``: a sample that blurs
+    over the pixel, the pixel that blurs and lets a sample through, and both.
+
+    Args:
+        frame: Color, depth and velocity, (B, ·, H, W).
+        config: Parameters; the paper's if left out.
+        **params: Single parameters over those of `config`.
+
+    Returns:
+        Color, scene-linear, (B, 3, H, W).
+
+    Differentiable: in color, in depth, in the velocity through the weights (not through the
+        positions of nearest lookups), and in every parameter that `torchblur params` calls
+        smooth.
+    Border: replicated.
+    Reference: McGuire, Hennessy, Bukowski, Osman 2012. We differ: depth is positive; a still
+        pixel keeps the velocity 0 and only its length is floored; jitter is Halton noise instead
+        of a hash; shutters that are not centered shift the taps along the velocity.
+    Raises: ConfigError for a bad parameter, FrameError if the frame has no depth.
+    """
+    result: Tensor = McGuire2012Blur(config, **params)(frame)
+    return result
+
+
+class McGuire2012Blur(BlurFilter):
+    """The tile-based filter of McGuire 2012: TileMax, NeighborMax, one gather. See `mcguire2012`.
+
+    `layers` adds "tile_max" and "neighbor_max" (half spread in px, (B, 2, Ty, Tx)) and "weight"
+    (the sum of all weights, (B, 1, H, W)).
+    """
+
+    name = "mcguire2012"
+    config_class = McGuire2012Config
+
+    def compute(self, frame: Frame, values: Values) -> dict[str, Tensor]:
+        """Return "color", "tile_max", "neighbor_max" and "weight"."""
+        return _layers(frame, values, self.engine)
+
+
+def _layers(frame: Frame, values: Values, engine: Engine) -> dict[str, Tensor]:
+    spread = spread_of(frame, values)
+    tiles = tile_max(spread.half, values.tile_size)
+    neighbors = neighbor_max(tiles)
+    dominant = tile_lookup(neighbors, frame.color, values.tile_size)
+    reach = length(dominant)
+    noise = noise_plane(values.noise, frame.color, seed=values.seed)
+    x, y = pixel_grid(frame.color)
+    inputs = {
+        "texture": texture_of(frame, spread),
+        "x": x,
+        "y": y,
+        "jitter": (noise - 0.5) * values.jitter,
+        "direction": direction(dominant),
+        "reach": reach,
+        "depth": frame.finite_depth(),
+        "length": spread.length,
+        "unit": spread.unit,
+        "extent": values.soft_depth_extent,
+    }
+    for key in (
+        "cone_slope",
+        "cylinder_inner",
+        "cylinder_outer",
+        "foreground_gain",
+        "background_gain",
+        "third_gain",
+        "min_length",
+    ):
+        inputs[key] = getattr(values, key)
+    options = _Options(
+        Shutter(1, values.shutter_position).center,
+        values.skip_middle_tap,
+        values.softness,
+        values.color_lookup,
+    )
+    sums = gather(_tap, options, values.num_samples, inputs, engine)
+    center_weight = values.center_gain / torch.maximum(spread.length, values.min_length)
+    color, weight = resolve(frame, sums, center_weight, reach > values.early_out)
+    return {"color": color, "tile_max": tiles, "neighbor_max": neighbors, "weight": weight}
+
+
+def _tap(index: Tensor, count: Tensor, inputs: Inputs, options: _Options) -> tuple[Tensor, ...]:
+    t = (2 * (index + 1 + inputs["jitter"]) / (count + 1) - 1).clamp(-1, 1)
+    along = (t + options.center) * inputs["reach"]
+    dx, dy = inputs["direction"].split(1, 1)
+    tap = sample(inputs, inputs["x"] - along * dx, inputs["y"] - along * dy, options.color_lookup)
+    front, behind = depth_weights(
+        inputs["depth"], tap.depth, inputs["extent"], relative=False, softness=options.softness
+    )
+    length_s = torch.maximum(tap.length, inputs["min_length"])
+    length_p = torch.maximum(inputs["length"], inputs["min_length"])
+    distance_s = distance_p = along.abs()
+    if options.center:
+        ux, uy = inputs["unit"].split(1, 1)
+        moved_s = tap.length * (tap.unit_x * dx + tap.unit_y * dy)
+        moved_p = inputs["length"] * (ux * dx + uy * dy)
+        distance_s = (along - options.center * moved_s).abs()
+        distance_p = (along - options.center * moved_p).abs()
+    slope, ends = inputs["cone_slope"], (inputs["cylinder_inner"], inputs["cylinder_outer"])
+    weight = (
+        inputs["foreground_gain"] * front * cone(distance_s, length_s, slope, options.softness)
+        + inputs["background_gain"] * behind * cone(distance_p, length_p, slope, options.softness)
+        + inputs["third_gain"]
+        * cylinder(distance_s, length_s, *ends)
+        * cylinder(distance_p, length_p, *ends)
+    )
+    if options.skip_middle_tap:
+        weight = weight * (2 * index != count - 1)
+    if tap.valid is not None:
+        weight = weight * tap.valid
+    return weight * tap.color, weight

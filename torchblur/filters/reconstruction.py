@@ -1,0 +1,248 @@
+"""What McGuire 2012 and Guertin 2014 share: parameters, half spreads, the texture of a tap."""
+
+from __future__ import annotations
+
+from typing import Annotated, NamedTuple
+
+import torch
+from torch import Tensor
+
+from torchblur.filters.base import FilterConfig, Values
+from torchblur.frame import Frame, Shutter
+from torchblur.ops.gather import Inputs, Lookup, lookup
+from torchblur.ops.noise import NoiseKind
+from torchblur.ops.velocity import direction, half_velocity, length
+from torchblur.params import Param
+
+__all__ = ["ReconstructionConfig", "Spread", "Tap", "resolve", "sample", "spread_of", "texture_of"]
+
+_WEIGHTS = "McGuire 2012, section 3.3 (restated by Tan 2022, appendix, eq. 5-10)"
+
+
+class ReconstructionConfig(FilterConfig):
+    """Constants of the cone, cylinder and depth weights, and of the lookups."""
+
+    num_samples: Annotated[
+        int,
+        Param(
+            symbol="N",
+            unit="taps",
+            low=1,
+            high=512,
+            scale="log",
+            grad="discrete",
+            source=_WEIGHTS,
+            meaning="taps of the gather",
+        ),
+    ] = 15
+    tile_size: Annotated[
+        int,
+        Param(
+            symbol="r",
+            unit="px",
+            low=1,
+            high=512,
+            scale="log",
+            grad="discrete",
+            source="McGuire 2012, section 3",
+            meaning="edge of a tile, and the longest half spread that is blurred",
+        ),
+    ] = 20
+    cone_slope: Annotated[
+        float,
+        Param(
+            low=0.1,
+            high=10.0,
+            scale="log",
+            grad="smooth",
+            source=_WEIGHTS,
+            meaning="slope of the cone weight over distance / length; 1 reaches 0 at the end",
+        ),
+    ] = 1.0
+    cylinder_inner: Annotated[
+        float,
+        Param(
+            low=0.0,
+            high=0.999,
+            grad="smooth",
+            source=_WEIGHTS,
+            meaning="distance / length where the cylinder weight begins to fall",
+        ),
+    ] = 0.95
+    cylinder_outer: Annotated[
+        float,
+        Param(
+            low=1.0,
+            high=4.0,
+            grad="smooth",
+            source=_WEIGHTS,
+            meaning="distance / length where the cylinder weight reaches 0",
+        ),
+    ] = 1.05
+    foreground_gain: Annotated[
+        float,
+        Param(
+            low=0.0,
+            high=8.0,
+            grad="smooth",
+            source=_WEIGHTS,
+            meaning="gain of the first weight: what blurs over the pixel from the front",
+        ),
+    ] = 1.0
+    background_gain: Annotated[
+        float,
+        Param(
+            low=0.0,
+            high=8.0,
+            grad="smooth",
+            source=_WEIGHTS,
+            meaning="gain of the second weight: what the pixel's own blur lets through",
+        ),
+    ] = 1.0
+    third_gain: Annotated[
+        float,
+        Param(
+            low=0.0,
+            high=32.0,
+            grad="smooth",
+            source=_WEIGHTS,
+            meaning="gain of the third weight: both blur over each other",
+        ),
+    ] = 2.0
+    min_length: Annotated[
+        float,
+        Param(
+            unit="px",
+            low=0.05,
+            high=4.0,
+            scale="log",
+            grad="smooth",
+            source=_WEIGHTS,
+            meaning="shortest half spread that the weights divide by",
+        ),
+    ] = 0.5
+    early_out: Annotated[
+        float,
+        Param(
+            unit="px",
+            low=0.0,
+            high=4.0,
+            grad="weak",
+            source="McGuire 2012, section 3.3",
+            meaning="a pixel is left as it is where the tile's half spread is not above this",
+        ),
+    ] = 0.505
+    softness: Annotated[
+        float,
+        Param(
+            low=0.0,
+            high=0.5,
+            grad="discrete",
+            source="torchblur",
+            meaning="rounds the corners of the clamped weights, so that gradients pass them",
+        ),
+    ] = 0.0
+    color_lookup: Annotated[
+        Lookup,
+        Param(
+            grad="discrete",
+            source="McGuire 2012",
+            meaning="lookup of the color; velocity and depth are always nearest",
+        ),
+    ] = "nearest"
+    noise: Annotated[
+        NoiseKind,
+        Param(
+            grad="discrete",
+            source="Guertin 2014, section 4.5; Jimenez 2014",
+            meaning="jitter per pixel: Halton points, interleaved gradient noise, or none",
+        ),
+    ] = "halton"
+    seed: Annotated[
+        int,
+        Param(
+            low=0,
+            high=2**31 - 1,
+            grad="discrete",
+            source="torchblur",
+            meaning="shifts the noise; give each frame of a sequence its own",
+        ),
+    ] = 0
+
+
+class Spread(NamedTuple):
+    """Half spread of each pixel, clamped to what the tiles can reach."""
+
+    half: Tensor
+    """V in px, (B, 2, H, W)."""
+    length: Tensor
+    """|V| in px, (B, 1, H, W)."""
+    unit: Tensor
+    """V / |V|, or 0 for a still pixel, (B, 2, H, W)."""
+
+
+def spread_of(frame: Frame, values: Values) -> Spread:
+    """Return the half spreads of a frame.
+
+    With a shutter that is not centered the taps reach twice as far from the pixel, so that the
+    longest half spread is half a tile.
+    """
+    longest = values.tile_size / (1 + abs(Shutter(1, values.shutter_position).center))
+    half = half_velocity(frame.velocity, values.shutter, longest)
+    return Spread(half, length(half), direction(half))
+
+
+def texture_of(frame: Frame, spread: Spread) -> Tensor:
+    """Return what a tap looks up, in one texture: color, û, |V|, depth, and validity if given.
+
+    Returns:
+        Planes, (B, 7 or 8, H, W).
+    """
+    planes = [frame.color, spread.unit, spread.length, frame.finite_depth()]
+    if frame.valid is not None:
+        planes.append(frame.valid.to(frame.dtype))
+    return torch.cat(planes, 1)
+
+
+class Tap(NamedTuple):
+    """What one tap sees."""
+
+    color: Tensor
+    unit_x: Tensor
+    unit_y: Tensor
+    length: Tensor
+    depth: Tensor
+    valid: Tensor | None
+
+
+def sample(inputs: Inputs, x: Tensor, y: Tensor, color_lookup: Lookup) -> Tap:
+    """Look up a tap at positions in px; the color bilinearly if asked for."""
+    texture = inputs["texture"]
+    planes = lookup(texture, x, y)
+    color = planes[:, :3]
+    if color_lookup == "bilinear":
+        color = lookup(texture[:, :3], x, y, "bilinear")
+    _, ux, uy, size, depth, *valid = planes.split((3, *[1] * (planes.shape[1] - 3)), 1)
+    return Tap(color, ux, uy, size, depth, valid[0] if valid else None)
+
+
+def resolve(
+    frame: Frame, sums: tuple[Tensor, ...], center_weight: Tensor, moving: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Return color and total weight: the normalized sum, or the pixel itself where it is still.
+
+    Args:
+        frame: The frame, for its color.
+        sums: Sums of ``weight · color`` and of ``weight`` over the taps.
+        center_weight: The pixel's own weight, broadcasts to (B, 1, H, W).
+        moving: Where the tile moves; elsewhere, and where the weights are zero, the color stays.
+
+    Returns:
+        Color (B, 3, H, W) and weight (B, 1, H, W).
+    """
+    if frame.valid is not None:
+        center_weight = center_weight * frame.valid.to(frame.dtype)
+    weight = sums[1] + center_weight
+    used = moving & (weight > 0)
+    blurred = (sums[0] + center_weight * frame.color) / torch.where(used, weight, 1.0)
+    return torch.where(used, blurred, frame.color), weight.expand(-1, -1, *frame.size)

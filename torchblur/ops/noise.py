@@ -1,0 +1,118 @@
+"""Noise per pixel for jittered taps: deterministic, tileable, seeded."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+from torchblur.ops.gather import pixel_grid
+
+__all__ = [
+    "NoiseKind",
+    "checkerboard",
+    "halton",
+    "halton_plane",
+    "interleaved_gradient_noise",
+    "noise_plane",
+]
+
+NoiseKind = Literal["halton", "gradient", "none"]
+
+_TILE = 32
+_BASES = (2, 3, 5, 7)
+_FRAME_STRIDE = 5.588238  # shift between frames that decorrelates interleaved gradient noise
+
+
+def halton(count: int, base: int) -> Tensor:
+    """Return the first points of the van der Corput sequence in a base, skipping 0.
+
+    Args:
+        count: Number of points.
+        base: A prime.
+
+    Returns:
+        Points in (0, 1), float64, shape (count,).
+    """
+    index = torch.arange(1, count + 1, dtype=torch.int64)
+    result = torch.zeros(count, dtype=torch.float64)
+    fraction = 1.0
+    while bool(index.any()):
+        fraction /= base
+        result += fraction * (index % base)
+        index = index // base
+    return result
+
+
+def halton_plane(like: Tensor, stream: int = 0, seed: int = 0) -> Tensor:
+    """Return a plane of Halton points: a shuffled tile of 32² points, repeated.
+
+    Args:
+        like: Any tensor of the image's size, (B, C, H, W).
+        stream: 0 to 3; streams use other bases, so that they do not correlate.
+        seed: Shuffles the tile; give each frame of a sequence its own.
+
+    Returns:
+        Values in [0, 1), (1, 1, H, W).
+
+    Reference: Guertin 2014, section 4.5, asks for a Halton sequence and does not say which pixel
+        gets which point; this shuffle is ours.
+    """
+    generator = torch.Generator().manual_seed(seed * len(_BASES) + stream)
+    order = torch.randperm(_TILE * _TILE, generator=generator)
+    tile = halton(_TILE * _TILE, _BASES[stream])[order].reshape(_TILE, _TILE)
+    height, width = like.shape[-2:]
+    repeated = tile.repeat(-(-height // _TILE), -(-width // _TILE))[:height, :width]
+    return repeated.to(device=like.device, dtype=like.dtype)[None, None]
+
+
+def interleaved_gradient_noise(like: Tensor, stream: int = 0, seed: int = 0) -> Tensor:
+    """Return ``frac(52.9829189 · frac(0.06711056 x + 0.00583715 y))``.
+
+    Args:
+        like: Any tensor of the image's size, (B, C, H, W).
+        stream: Shifts the pattern, so that two streams differ.
+        seed: Shifts the pattern; give each frame of a sequence its own.
+
+    Returns:
+        Values in [0, 1), (1, 1, H, W).
+
+    Reference: Jimenez 2014.
+    """
+    x, y = pixel_grid(like)
+    shift = _FRAME_STRIDE * (seed % 64) + 47.0 * stream
+    inner = 0.06711056 * (x + shift) + 0.00583715 * (y + shift)
+    return torch.remainder(52.9829189 * torch.remainder(inner, 1.0), 1.0)
+
+
+def checkerboard(like: Tensor) -> Tensor:
+    """Return ``(x + y) & 1``: 0 and 1 by turns.
+
+    Args:
+        like: Any tensor of the image's size, (B, C, H, W).
+
+    Returns:
+        Zeros and ones, (1, 1, H, W).
+    """
+    x, y = pixel_grid(like)
+    return torch.remainder(x + y, 2)
+
+
+def noise_plane(kind: NoiseKind, like: Tensor, stream: int = 0, seed: int = 0) -> Tensor:
+    """Return a plane of noise by its name; "none" is one half everywhere.
+
+    Args:
+        kind: "halton", "gradient" (interleaved gradient noise) or "none".
+        like: Any tensor of the image's size, (B, C, H, W).
+        stream: Streams of one seed do not correlate.
+        seed: Another pattern for another seed.
+
+    Returns:
+        Values in [0, 1), (1, 1, H, W).
+    """
+    if kind == "halton":
+        return halton_plane(like, stream, seed)
+    if kind == "gradient":
+        return interleaved_gradient_noise(like, stream, seed)
+    return torch.full_like(like[:1, :1], 0.5)

@@ -1,0 +1,99 @@
+"""Presets: a filter's name and parameters in a YAML file, with the evidence that made them.
+
+::
+
+    filter: guertin2014
+    params: {kappa: 31.2, third_gain: 5.1}
+    evidence: {...}          # data, metric, split, figures, command: free form
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from pydantic import Field
+
+from torchblur.errors import ConfigError
+from torchblur.filters import BlurFilter, get_filter, registered_filters
+from torchblur.io.yaml import load_yaml, save_yaml
+from torchblur.ops.gather import Engine
+from torchblur.params import Config, build
+
+__all__ = ["Preset", "create_filter", "load_preset", "save_preset"]
+
+
+class Preset(Config):
+    """A filter with its parameters, and where they come from."""
+
+    filter: str
+    """Registered name of the filter."""
+    params: dict[str, Any] = Field(default_factory=dict)
+    """Parameters that differ from the paper's defaults, by name."""
+    evidence: dict[str, Any] = Field(default_factory=dict)
+    """What the parameters were fitted to and how good they are; nothing reads it back."""
+
+
+def load_preset(path: str | Path) -> Preset:
+    """Read a preset and check its parameters.
+
+    Args:
+        path: A YAML file as `save_preset` or `torchblur tune` writes it.
+
+    Raises:
+        ConfigError: no such file, unknown filter or parameter, value out of range.
+    """
+    place = str(path)
+    preset = build(Preset, load_yaml(path), place)
+    try:
+        get_filter(preset.filter)
+    except ConfigError as error:
+        raise ConfigError(f"{error} ({place}: filter)") from error
+    build(get_filter(preset.filter).config_class, preset.params, f"{place}: params")
+    return preset
+
+
+def save_preset(
+    path: str | Path, preset: Preset, *, comment: str | None = None, overwrite: bool = False
+) -> None:
+    """Write a preset so that `load_preset` and `create_filter` take it.
+
+    Args:
+        path: Where to.
+        preset: What to write.
+        comment: Lines for the head of the file.
+        overwrite: Replace an existing file.
+
+    Raises:
+        ConfigError: the file exists and `overwrite` is off, or it cannot be written.
+    """
+    if Path(path).exists() and not overwrite:
+        raise ConfigError(f"{path} exists; use another name or overwrite it")
+    save_yaml(path, preset.model_dump(), comment=comment)
+
+
+def create_filter(
+    name_or_preset: str | Path, *, engine: Engine = "eager", **params: Any
+) -> BlurFilter:
+    """Make a filter from its name or from a preset file.
+
+    Args:
+        name_or_preset: A registered name ("guertin2014"), or the path of a preset.
+        engine: "eager", or "compiled" to compile the tap function.
+        **params: Single parameters over the preset's: ``num_samples=15, kappa=30.0``.
+
+    Returns:
+        A Module: ``blur(frame) -> (B, 3, H, W)``.
+
+    Raises:
+        ConfigError: neither a filter nor a file, unknown parameter, value out of range.
+
+    Example:
+        >>> create_filter("guertin2014", num_samples=15, kappa=30.0)
+        Guertin2014Blur(num_samples=15, kappa=30.0)
+    """
+    name = str(name_or_preset)
+    if name not in registered_filters() and (Path(name).suffix or Path(name).exists()):
+        preset = load_preset(name)
+        name, params = preset.filter, preset.params | params
+    return get_filter(name)(None, engine=engine, **params)
