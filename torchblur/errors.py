@@ -9,7 +9,14 @@ from __future__ import annotations
 import difflib
 from collections.abc import Iterable
 
-__all__ = ["ConfigError", "FileFormatError", "FrameError", "TorchblurError", "nearest_name"]
+__all__ = [
+    "ConfigError",
+    "FileFormatError",
+    "FrameError",
+    "OutputError",
+    "TorchblurError",
+    "nearest_name",
+]
 
 
 class TorchblurError(ValueError):
@@ -26,6 +33,10 @@ class ConfigError(TorchblurError):
 
 class FileFormatError(TorchblurError):
     """A file cannot be read as what it claims to be, or lacks a channel."""
+
+
+class OutputError(TorchblurError):
+    """A result cannot be written where it should go, or one is there already."""
 
 
 def nearest_name(name: str, valid: Iterable[str]) -> str:
