@@ -179,6 +179,18 @@ class TestBatch:
         torch.testing.assert_close(metric(images, reference), expected, rtol=0, atol=1e-5)
 
 
+def test_a_firefly_is_finite():
+    # Its square overflows float32 in the tone curve.
+    image, reference = torch.ones(1, 3, 12, 12), torch.ones(1, 3, 12, 12)
+    image[..., 5, 5] = 1e30
+    image.requires_grad_()
+    error = flip_hdr(image, reference)
+    error.sum().backward()
+    assert torch.isfinite(error).all()
+    assert float(error.detach()[..., 5, 5]) > 0.05
+    assert torch.isfinite(image.grad).all()
+
+
 def test_properties():
     image, reference = structured_pair(32, 40)
     error = flip_ldr(image, reference)

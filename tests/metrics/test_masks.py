@@ -46,6 +46,12 @@ class TestMaskedMean:
         mean.sum().backward()
         assert values.grad[0].abs().max() == 0
 
+    def test_gradient_to_the_weights(self):
+        values = torch.tensor([1.0, 3.0]).view(1, 1, 1, 2).expand(2, 1, 1, 2)
+        weights = torch.tensor([[0.5, 0.5], [0.0, 0.0]]).view(2, 1, 1, 2).requires_grad_()
+        masked_mean(values, weights).sum().backward()
+        assert weights.grad.flatten().tolist() == [-1.0, 1.0, 0.0, 0.0]
+
     def test_refuses_bad_masks(self):
         values = torch.ones(2, 3, 4, 5)
         with pytest.raises(FrameError, match=r"`mask` must have shape \(2, 1, 4, 5\).*\(3, 1, 4,"):
@@ -90,10 +96,11 @@ def span(first, last):
 class TestBorderBand:
     @pytest.mark.parametrize("ids", [True, False])
     @pytest.mark.parametrize("margin", [0, 2])
-    def test_moving_square_by_hand(self, ids, margin):
+    @pytest.mark.parametrize("speed", [16.0, 15.0])
+    def test_moving_square_by_hand(self, ids, margin, speed):
         # 16 px/frame and a shutter of half a frame: the vertical edges sweep 4 px to both sides.
-        # A border is two pixels wide, one on each side, before it moves.
-        band = border_band(square_frame((16.0, 0.0), ids=ids), HALF_OPEN, margin=margin)
+        # A border is two pixels wide, one on each side, before it moves. 3.75 px round to 4.
+        band = border_band(square_frame((speed, 0.0), ids=ids), HALF_OPEN, margin=margin)
         columns, rows = rows_and_columns(band, 25, 32)
         reach = 4 + margin
         assert columns == span(24 - reach, 25 + reach) + span(39 - reach, 40 + reach)
@@ -130,6 +137,7 @@ class TestBorderBand:
         )
         assert bent[0, 0, 29 + 2, 40 + 4]
         assert not straight[0, 0, 29 + 2, 40 + 4]
+        assert rows_and_columns(bent, 25, 32)[1] == span(19, 20 + 2) + span(29, 30 + 2)
 
     @pytest.mark.parametrize("ids", [True, False])
     def test_nothing_moves(self, ids):
@@ -171,6 +179,10 @@ class TestBorderBand:
         frame = square_frame((400.0, 0.0))
         columns, _ = rows_and_columns(border_band(frame, HALF_OPEN), 25, 32)
         assert columns == span(0, SIZE[1] - 1)
+
+    def test_sweeps_do_not_enter_on_the_other_side(self):
+        band = border_band(square_frame((0.0, -60.0)), Shutter(0.5, "leading"), margin=0)
+        assert rows_and_columns(band, 25, 32)[1] == span(0, 30)
 
     def test_one_pixel_frame(self):
         frame = Frame(color=torch.zeros(1, 3, 1, 1), velocity=torch.ones(1, 2, 1, 1) * 9)
