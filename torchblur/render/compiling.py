@@ -1,0 +1,82 @@
+"""Compile the renderer's inner functions, and go on without a compiler where there is none."""
+
+from __future__ import annotations
+
+import functools
+import importlib
+import warnings
+from collections.abc import Callable
+from types import FunctionType
+from typing import Any, Literal
+
+import torch
+
+from torchblur.errors import ConfigError
+
+__all__ = ["Engine", "check_engine", "execute"]
+
+Engine = Literal["auto", "eager", "compiled"]
+
+_state = {"works": True}
+
+
+def check_engine(engine: str) -> None:
+    """Refuse a name that is no engine.
+
+    Raises:
+        ConfigError: if it is not "auto", "eager" or "compiled".
+    """
+    if engine not in ("auto", "eager", "compiled"):
+        raise ConfigError(f"`engine` must be 'auto', 'eager' or 'compiled', got {engine!r}")
+
+
+def execute(function: Callable[..., Any], compile_it: bool, *arguments: Any) -> Any:
+    """Call a function of tensors, compiled if asked for and possible.
+
+    A function is compiled on its first call per process, and anew only for another number of
+    nested motions; it must be called with one size of tensors.
+
+    Args:
+        function: Pure function of tensors.
+        compile_it: Whether to compile. If that fails there is one warning per process, and all
+            calls run eagerly from then on.
+        arguments: Passed on.
+
+    Returns:
+        What the function returns.
+    """
+    if compile_it and _state["works"]:
+        try:
+            return _compiled(function)(*arguments)
+        except _compiler_errors() as error:
+            _state["works"] = False
+            reason = (str(error).splitlines() or [type(error).__name__])[0]
+            warnings.warn(
+                f"torch.compile does not work here ({reason}); references are rendered without "
+                "it, several times slower",
+                stacklevel=2,
+            )
+    return function(*arguments)
+
+
+@functools.cache
+def _compiled(function: Callable[..., Any]) -> Callable[..., Any]:
+    # Closures of one factory share their code, and torch counts compilations per code object:
+    # with a copy of the code each kind of body and texture has a count of its own.
+    code = function.__code__.replace(co_name=function.__name__)
+    own = FunctionType(
+        code, function.__globals__, function.__name__, function.__defaults__, function.__closure__
+    )
+    with warnings.catch_warnings():
+        # torch warns of itself where it is loaded; that is no news to our user.
+        warnings.simplefilter("ignore", DeprecationWarning)
+        importlib.import_module("torch._inductor.compile_fx")
+    return torch.compile(own, dynamic=False, fullgraph=True)
+
+
+def _compiler_errors() -> tuple[type[Exception], ...]:
+    """Errors of torch.compile itself; what else goes wrong is not hidden."""
+    from torch._dynamo.exc import BackendCompilerFailed  # imported late: it is slow to load
+    from torch._inductor.exc import InductorError
+
+    return BackendCompilerFailed, InductorError

@@ -1,0 +1,119 @@
+"""What a scene is: a camera, a light, a sky and bodies, as a YAML file gives them."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Annotated, Literal
+
+from pydantic import Field, model_validator
+from ruamel.yaml import YAML
+from ruamel.yaml.error import YAMLError
+
+from torchblur.errors import ConfigError
+from torchblur.params import Config, build
+from torchblur.render.bodies import Solid
+from torchblur.render.camera import Camera
+from torchblur.render.motion import Level, Number, Placed, Triple
+from torchblur.render.textures import SolidTexture, Texture
+
+__all__ = ["Group", "Light", "Scene", "load_scene"]
+
+
+class Light(Config):
+    """A fixed light at no distance, without shadows: ``ambient + (1 - ambient) max(n.l, 0)``."""
+
+    direction: Triple = Field(
+        (0.4, 0.8, 0.6), description="from the scene towards the light, in the world"
+    )
+    ambient: Annotated[Number, Field(ge=0, le=1)] = Field(
+        0.35, description="share of the light that falls on all sides, 0 to 1"
+    )
+
+    @model_validator(mode="after")
+    def _direction_has_length(self) -> Light:
+        if not any(self.direction):
+            raise ValueError(f"`direction` must not be a zero vector, got {list(self.direction)}")
+        return self
+
+
+class Group(Placed):
+    """Bodies that move as one; their own placements are relative to the group."""
+
+    kind: Literal["group"]
+    object_id: int | None = Field(
+        None, ge=1, description="number of all bodies in it that have none of their own"
+    )
+    bodies: tuple[Body, ...] = Field(min_length=1, description="bodies and groups in it")
+
+
+Body = Annotated[Solid | Group, Field(discriminator="kind")]
+"""A body or a group, told apart by `kind`."""
+
+
+class Scene(Config):
+    """A scene that moves, in scene units and frames.
+
+    The world is right-handed; y is up in the scenes that come with torchblur. Radiance is
+    scene-linear.
+    """
+
+    camera: Camera = Field(description="the camera and its motion")
+    light: Light = Field(default_factory=Light, description="the light on all bodies")
+    sky: Texture = Field(
+        default_factory=lambda: SolidTexture(kind="solid", color=(0.25, 0.35, 0.5)),
+        description="radiance where no body is; patterns are taken at the unit view direction",
+    )
+    bodies: tuple[Body, ...] = Field(min_length=1, description="bodies and groups, at least one")
+
+    def placed_bodies(self) -> list[tuple[Solid, list[Level], int]]:
+        """Return each body with its motions, outermost first, and its object id."""
+        return [
+            found
+            for number, body in enumerate(self.bodies, start=1)
+            for found in _unfold(body, [], number)
+        ]
+
+
+Group.model_rebuild()
+Scene.model_rebuild()
+
+
+def load_scene(path: str | os.PathLike[str]) -> Scene:
+    """Read a scene from a YAML file.
+
+    Args:
+        path: The file; `configs/scenes/` has examples.
+
+    Returns:
+        The scene.
+
+    Raises:
+        ConfigError: the file cannot be read, is not YAML, or does not describe a scene; with the
+            file, the place in it, the rule and the value.
+    """
+    try:
+        data = YAML(typ="safe", pure=True).load(Path(path).read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError) as error:
+        raise ConfigError(f"the scene {os.fspath(path)} cannot be read: {error}") from error
+    except YAMLError as error:
+        raise ConfigError(f"{os.fspath(path)} is not valid YAML: {error}") from error
+    if not isinstance(data, dict):
+        raise ConfigError(
+            f"a scene must be a mapping with `camera` and `bodies`, got {type(data).__name__} "
+            f"({os.fspath(path)})"
+        )
+    return build(Scene, data, os.fspath(path))
+
+
+def _unfold(
+    body: Solid | Group, outer: list[Level], number: int
+) -> Iterator[tuple[Solid, list[Level], int]]:
+    levels = [*outer, body.level()]
+    number = body.object_id or number
+    if not isinstance(body, Group):
+        yield body, levels, number
+        return
+    for inner in body.bodies:
+        yield from _unfold(inner, levels, number)
