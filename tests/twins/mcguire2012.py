@@ -50,8 +50,9 @@ def gather(pixel, vmax, noise, settings):
 
     direction = common.norm(vmax)
     shift = settings.jitter * noise / 2  # j in [-½, ½] at jitter 1
+    skips_middle = settings.skip_middle_tap and settings.c == 0  # it lies on X only if centered
     for i in range(settings.num_samples):
-        if settings.skip_middle_tap and 2 * i == settings.num_samples - 1:
+        if skips_middle and 2 * i == settings.num_samples - 1:
             continue  # i ≠ (N - 1) / 2
         t = common.tap_time(i, shift, settings.num_samples)
         position = (t + settings.c) * common.length(vmax)

@@ -103,7 +103,7 @@ class BlurFilter(nn.Module):
             ConfigError: if a parameter has left its range; `project_` brings it back.
         """
         now = {
-            key: float(getattr(self, key))
+            key: float(getattr(self, key).detach())
             for key, spec in declared(self.config_class).items()
             if spec.grad != "discrete"
         }

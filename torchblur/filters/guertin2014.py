@@ -21,8 +21,8 @@ from torchblur.frame import Frame, Shutter
 from torchblur.ops.color import luma
 from torchblur.ops.gather import Engine, Inputs, Lookup, gather, pixel_grid
 from torchblur.ops.noise import checkerboard, noise_plane
-from torchblur.ops.tiles import neighbor_max, tile_lookup, tile_max, tile_offset, tile_variance
-from torchblur.ops.velocity import direction, length, quantize_uint8
+from torchblur.ops.tiles import tile_lookup, tile_offset, tile_variance
+from torchblur.ops.velocity import direction, length
 from torchblur.ops.weights import cone, cylinder, depth_weights, power, saturate
 from torchblur.params import Param
 
@@ -189,7 +189,9 @@ def guertin2014(frame: Frame, config: Guertin2014Config | None = None, **params:
         the perpendicular for slow pixels (eq. 1 is reversed); depth comparison has the sign that
         the text means; both directions are unit vectors and taps on either reach as far as the
         dominant velocity; products of directions are absolute; positions are rounded, not
-        floored; taps do not leave [-1, 1]; velocities are floats unless asked for in 8 bits.
+        floored, and T is the distance before rounding; samples below a thousandth of a pixel
+        have no direction (B = 0); taps do not leave [-1, 1]; velocities are floats unless asked
+        for in 8 bits.
     Raises: ConfigError for a bad parameter, FrameError if the frame has no depth.
     """
     result: Tensor = Guertin2014Blur(config, **params)(frame)
@@ -213,12 +215,10 @@ class Guertin2014Blur(BlurFilter):
 
 
 def _layers(frame: Frame, values: Values, engine: Engine) -> dict[str, Tensor]:
-    spread = spread_of(frame, values)
-    if values.velocity_encoding == "uint8":
-        half = quantize_uint8(spread.half, values.tile_size)
-        spread = Spread(half, length(half), direction(half))
-    tiles = tile_max(spread.half, values.tile_size)
-    layers = {"tile_max": tiles, "neighbor_max": neighbor_max(tiles, cull=values.neighbor_culling)}
+    spread, tiles = spread_of(
+        frame, values, uint8=values.velocity_encoding == "uint8", cull=values.neighbor_culling
+    )
+    layers = {"tile_max": tiles.own, "neighbor_max": tiles.neighborhood}
     noise = noise_plane(values.noise, frame.color, 0, values.seed)
     offset = None
     if values.stochastic_tiles:
@@ -228,7 +228,7 @@ def _layers(frame: Frame, values: Values, engine: Engine) -> dict[str, Tensor]:
     inputs = _tap_inputs(frame, spread, dominant, values)
     inputs["jitter"] = (2 * noise - 1) * values.eta * values.phi / values.num_samples
     if values.sample_assignment == "variance":
-        layers["tile_variance"] = tile_variance(tiles, _per_image(values.min_length))
+        layers["tile_variance"] = tile_variance(tiles.own, _per_image(values.min_length))
         inputs["variance"] = tile_lookup(
             layers["tile_variance"], frame.color, values.tile_size, bilinear=True
         )
@@ -332,9 +332,7 @@ def _tap(index: Tensor, count: Tensor, inputs: Inputs, options: _Options) -> tup
     dx, dy = d.split(1, 1)
     tap = sample(inputs, inputs["x"] - along * dx, inputs["y"] - along * dy, options.color_lookup)
     weight = _weight(along, d, tap, own, inputs, options)
-    if tap.valid is not None:
-        weight = weight * tap.valid
-    return weight * tap.color, weight
+    return weight * tap.color, weight if tap.valid is None else weight * tap.valid
 
 
 def _takes_center_direction(index: Tensor, inputs: Inputs, options: _Options) -> Tensor:

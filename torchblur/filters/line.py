@@ -98,14 +98,15 @@ def _blur(frame: Frame, values: Values, engine: Engine) -> Tensor:
     center = Shutter(1, values.shutter_position).center
     x, y = pixel_grid(frame.color)
     inputs = {
-        "color": frame.color,
+        "texture": frame.color,
         "half": frame.velocity * (values.shutter * 0.5),
         "x": x,
         "y": y,
         "center": torch.full_like(x[:, :, :, :1], float(center)),
     }
     if frame.valid is not None:
-        inputs["valid"] = frame.valid.to(frame.dtype)
+        valid = frame.valid.to(frame.dtype)
+        inputs["texture"] = torch.cat((frame.color * valid, valid), 1)
     color, weight = gather(_tap, _Options(values.lookup), values.num_samples, inputs, engine)
     return torch.where(weight > 0, color / torch.where(weight > 0, weight, 1.0), frame.color)
 
@@ -115,8 +116,7 @@ def _tap(index: Tensor, count: Tensor, inputs: Inputs, options: _Options) -> tup
     time = (2 * index + 1) / count - 1 + inputs["center"]
     x = inputs["x"] - time * inputs["half"][:, :1]
     y = inputs["y"] - time * inputs["half"][:, 1:]
-    color = lookup(inputs["color"], x, y, options.lookup)
-    if "valid" in inputs:
-        weight = lookup(inputs["valid"], x, y)
-        return weight * color, weight
-    return color, torch.ones_like(color[:, :1])
+    texture = lookup(inputs["texture"], x, y, options.lookup)
+    # The fourth plane is the validity, by which the color is multiplied already.
+    weight = texture[:, 3:] if texture.shape[1] == 4 else torch.ones_like(texture[:, :1])
+    return texture[:, :3], weight

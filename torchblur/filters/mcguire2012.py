@@ -18,7 +18,7 @@ from torchblur.filters.reconstruction import (
 from torchblur.frame import Frame, Shutter
 from torchblur.ops.gather import Engine, Inputs, Lookup, gather, pixel_grid
 from torchblur.ops.noise import noise_plane
-from torchblur.ops.tiles import neighbor_max, tile_lookup, tile_max
+from torchblur.ops.tiles import tile_lookup
 from torchblur.ops.velocity import direction, length
 from torchblur.ops.weights import cone, cylinder, depth_weights
 from torchblur.params import Param
@@ -50,7 +50,8 @@ class McGuire2012Config(ReconstructionConfig):
     skip_middle_tap: Annotated[
         bool,
         Param(grad="discrete", source="McGuire 2012, section 3.3",
-              meaning="leave out the tap nearest to the pixel, which has its own weight"),
+              meaning="leave out the tap nearest to the pixel, which has its own weight "
+                      "(centered shutter only)"),
     ] = True
 # fmt: on
 
@@ -83,7 +84,8 @@ def mcguire2012(frame: Frame, config: McGuire2012Config | None = None, **params:
     Border: replicated.
     Reference: McGuire, Hennessy, Bukowski, Osman 2012. We differ: depth is positive; a still
         pixel keeps the velocity 0 and only its length is floored; jitter is Halton noise instead
-        of a hash; shutters that are not centered shift the taps along the velocity.
+        of a hash; the distance T is that before the position is rounded to a pixel; shutters
+        that are not centered shift the taps along the velocity.
     Raises: ConfigError for a bad parameter, FrameError if the frame has no depth.
     """
     result: Tensor = McGuire2012Blur(config, **params)(frame)
@@ -106,10 +108,8 @@ class McGuire2012Blur(BlurFilter):
 
 
 def _layers(frame: Frame, values: Values, engine: Engine) -> dict[str, Tensor]:
-    spread = spread_of(frame, values)
-    tiles = tile_max(spread.half, values.tile_size)
-    neighbors = neighbor_max(tiles)
-    dominant = tile_lookup(neighbors, frame.color, values.tile_size)
+    spread, tiles = spread_of(frame, values)
+    dominant = tile_lookup(tiles.neighborhood, frame.color, values.tile_size)
     reach = length(dominant)
     noise = noise_plane(values.noise, frame.color, seed=values.seed)
     x, y = pixel_grid(frame.color)
@@ -137,14 +137,19 @@ def _layers(frame: Frame, values: Values, engine: Engine) -> dict[str, Tensor]:
         inputs[key] = getattr(values, key)
     options = _Options(
         Shutter(1, values.shutter_position).center,
-        values.skip_middle_tap,
+        values.skip_middle_tap and values.shutter_position == "centered",
         values.softness,
         values.color_lookup,
     )
     sums = gather(_tap, options, values.num_samples, inputs, engine)
     center_weight = values.center_gain / torch.maximum(spread.length, values.min_length)
     color, weight = resolve(frame, sums, center_weight, reach > values.early_out)
-    return {"color": color, "tile_max": tiles, "neighbor_max": neighbors, "weight": weight}
+    return {
+        "color": color,
+        "tile_max": tiles.own,
+        "neighbor_max": tiles.neighborhood,
+        "weight": weight,
+    }
 
 
 def _tap(index: Tensor, count: Tensor, inputs: Inputs, options: _Options) -> tuple[Tensor, ...]:
@@ -174,6 +179,4 @@ def _tap(index: Tensor, count: Tensor, inputs: Inputs, options: _Options) -> tup
     )
     if options.skip_middle_tap:
         weight = weight * (2 * index != count - 1)
-    if tap.valid is not None:
-        weight = weight * tap.valid
-    return weight * tap.color, weight
+    return weight * tap.color, weight if tap.valid is None else weight * tap.valid

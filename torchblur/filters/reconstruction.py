@@ -11,10 +11,20 @@ from torchblur.filters.base import FilterConfig, Values
 from torchblur.frame import Frame, Shutter
 from torchblur.ops.gather import Inputs, Lookup, lookup
 from torchblur.ops.noise import NoiseKind
-from torchblur.ops.velocity import direction, half_velocity, length
+from torchblur.ops.tiles import neighbor_max, tile_max
+from torchblur.ops.velocity import clamp_length, direction, half_velocity, length, quantize_uint8
 from torchblur.params import Param
 
-__all__ = ["ReconstructionConfig", "Spread", "Tap", "resolve", "sample", "spread_of", "texture_of"]
+__all__ = [
+    "ReconstructionConfig",
+    "Spread",
+    "Tap",
+    "Tiles",
+    "resolve",
+    "sample",
+    "spread_of",
+    "texture_of",
+]
 
 _WEIGHTS = "McGuire 2012, section 3.3 (restated by Tan 2022, appendix, eq. 5-10)"
 
@@ -181,15 +191,38 @@ class Spread(NamedTuple):
     """V / |V|, or 0 for a still pixel, (B, 2, H, W)."""
 
 
-def spread_of(frame: Frame, values: Values) -> Spread:
-    """Return the half spreads of a frame.
+class Tiles(NamedTuple):
+    """Longest half spreads per tile in px, (B, 2, Ty, Tx): of the tile, and of those around."""
+
+    own: Tensor
+    neighborhood: Tensor
+
+
+def spread_of(
+    frame: Frame, values: Values, *, uint8: bool = False, cull: bool = False
+) -> tuple[Spread, Tiles]:
+    """Return the half spreads of a frame, per pixel and per tile.
 
     With a shutter that is not centered the taps reach twice as far from the pixel, so that the
-    longest half spread is half a tile.
+    longest half spread is half a tile. Tiles choose by the length before it is clamped: clamped
+    vectors are all equally long, and rounding would choose among them.
+
+    Args:
+        frame: The frame.
+        values: Shutter and tile size.
+        uint8: Store per-pixel vectors in eight bits, and choose among those.
+        cull: Leave out diagonal tiles that cannot reach the middle one.
     """
     longest = values.tile_size / (1 + abs(Shutter(1, values.shutter_position).center))
-    half = half_velocity(frame.velocity, values.shutter, longest)
-    return Spread(half, length(half), direction(half))
+    whole = half_velocity(frame.velocity, values.shutter)
+    half = clamp_length(whole, longest)
+    if uint8:
+        whole = half = quantize_uint8(half, values.tile_size)
+    tiles = tile_max(whole, values.tile_size)
+    around = neighbor_max(tiles, cull=cull)
+    if not uint8:
+        tiles, around = clamp_length(tiles, longest), clamp_length(around, longest)
+    return Spread(half, length(half), direction(half)), Tiles(tiles, around)
 
 
 def texture_of(frame: Frame, spread: Spread) -> Tensor:
@@ -200,12 +233,13 @@ def texture_of(frame: Frame, spread: Spread) -> Tensor:
     """
     planes = [frame.color, spread.unit, spread.length, frame.finite_depth()]
     if frame.valid is not None:
-        planes.append(frame.valid.to(frame.dtype))
+        valid = frame.valid.to(frame.dtype)
+        planes = [frame.color * valid, *planes[1:], valid]
     return torch.cat(planes, 1)
 
 
 class Tap(NamedTuple):
-    """What one tap sees."""
+    """What one tap sees; the color is multiplied by the validity, where there is one."""
 
     color: Tensor
     unit_x: Tensor
@@ -219,10 +253,10 @@ def sample(inputs: Inputs, x: Tensor, y: Tensor, color_lookup: Lookup) -> Tap:
     """Look up a tap at positions in px; the color bilinearly if asked for."""
     texture = inputs["texture"]
     planes = lookup(texture, x, y)
-    color = planes[:, :3]
+    color, ux, uy, size, depth, *valid = planes.split((3, *[1] * (planes.shape[1] - 3)), 1)
     if color_lookup == "bilinear":
         color = lookup(texture[:, :3], x, y, "bilinear")
-    _, ux, uy, size, depth, *valid = planes.split((3, *[1] * (planes.shape[1] - 3)), 1)
+        valid = [lookup(v, x, y, "bilinear") for v in texture[:, 7:].split(1, 1) if valid]
     return Tap(color, ux, uy, size, depth, valid[0] if valid else None)
 
 

@@ -10,7 +10,6 @@ compiled; its index and their number are tensors, so that neither compiles anew.
 from __future__ import annotations
 
 import functools
-import warnings
 from collections.abc import Callable, Hashable, Mapping
 from typing import Any, Literal
 
@@ -19,6 +18,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from torchblur.errors import ConfigError
+from torchblur.ops.compiling import compiler_errors, load_compiler, warn_no_compiler
 
 __all__ = ["Engine", "Inputs", "Lookup", "TapFunction", "gather", "lookup", "pixel_grid"]
 
@@ -70,10 +70,10 @@ def gather(
                 return _apply(step, num_samples, names, *tensors)
             with torch.no_grad():
                 return _sum_taps(step, num_samples, dict(inputs))
-        except _compiler_errors() as error:
+        except compiler_errors() as error:
             if candidate == "eager":
                 raise
-            _warn_no_compiler(str(error).splitlines()[0] if str(error) else type(error).__name__)
+            warn_no_compiler((str(error).splitlines() or [type(error).__name__])[0])
     raise AssertionError("unreachable")
 
 
@@ -119,6 +119,7 @@ _apply: Callable[..., tuple[Tensor, ...]] = _Gather.apply
 def _sum_taps(step: _Step, num_samples: int, inputs: Inputs) -> tuple[Tensor, ...]:
     like = next(iter(inputs.values()))
     count = _scalar(num_samples, like)
+    inputs = {name: tensor.detach() for name, tensor in inputs.items()}
     sums: tuple[Tensor, ...] = ()
     for index in range(num_samples):
         sums = step(sums, _scalar(index, like), count, inputs)
@@ -139,22 +140,10 @@ def _step(tap: TapFunction, options: Hashable, engine: Engine) -> _Step:
         added = tap(index, count, inputs, options)
         return tuple(s + a for s, a in zip(sums, added, strict=True)) if sums else added
 
-    return torch.compile(step, dynamic=True) if engine == "compiled" else step
-
-
-def _compiler_errors() -> tuple[type[Exception], ...]:
-    from torch._dynamo.exc import BackendCompilerFailed  # imported late: it is slow to load
-    from torch._inductor.exc import InductorError
-
-    return (BackendCompilerFailed, InductorError)
-
-
-@functools.lru_cache(maxsize=1)
-def _warn_no_compiler(reason: str) -> None:
-    warnings.warn(
-        f"torch.compile does not work here ({reason}); the eager engine is used instead",
-        stacklevel=3,
-    )
+    if engine == "compiled":
+        load_compiler()
+        return torch.compile(step, dynamic=True)
+    return step
 
 
 # -- lookups ---------------------------------------------------------------------------------------

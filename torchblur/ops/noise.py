@@ -81,8 +81,9 @@ def interleaved_gradient_noise(like: Tensor, stream: int = 0, seed: int = 0) -> 
     Reference: Jimenez 2014.
     """
     x, y = pixel_grid(like)
-    shift = _FRAME_STRIDE * (seed % 64) + 47.0 * stream
-    inner = 0.06711056 * (x + shift) + 0.00583715 * (y + shift)
+    shift = _FRAME_STRIDE * (seed % 64)
+    shift_x, shift_y = shift + 13.0 * stream, shift + 29.0 * stream  # no correlation: measured
+    inner = 0.06711056 * (x + shift_x) + 0.00583715 * (y + shift_y)
     return torch.remainder(52.9829189 * torch.remainder(inner, 1.0), 1.0)
 
 

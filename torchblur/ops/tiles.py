@@ -6,8 +6,6 @@ padded by replication at its right and lower edge.
 
 from __future__ import annotations
 
-import math
-
 import torch
 import torch.nn.functional as F
 from torch import Tensor
@@ -16,8 +14,6 @@ from torchblur.ops.gather import lookup, pixel_grid
 from torchblur.ops.velocity import direction, length
 
 __all__ = ["neighbor_max", "tile_lookup", "tile_max", "tile_offset", "tile_variance"]
-
-_COS_45 = math.sqrt(0.5)
 
 
 def tile_max(velocity: Tensor, tile_size: int) -> Tensor:
@@ -88,12 +84,11 @@ def _neighborhood(tiles: Tensor) -> Tensor:
 
 
 def _reaches_middle(neighbors: Tensor) -> Tensor:
+    # |v̂ · ô| > cos 45° for a diagonal offset o, squared and without the rounding.
     offsets = [(x, y) for y in (-1, 0, 1) for x in (-1, 0, 1)]
     ox, oy = neighbors.new_tensor(offsets).T.reshape(2, 1, 9, 1, 1)
-    unit = direction(neighbors.detach().flatten(0, 1)).reshape(neighbors.shape)
-    cosine = (unit[:, :, 0] * ox + unit[:, :, 1] * oy).abs() * _COS_45
     on_axis = ox * oy == 0
-    reaches: Tensor = on_axis | (cosine > _COS_45)
+    reaches: Tensor = on_axis | (ox * oy * neighbors[:, :, 0] * neighbors[:, :, 1] > 0)
     return reaches
 
 

@@ -1,0 +1,113 @@
+import subprocess
+import sys
+
+import pytest
+import torch
+
+from torchblur.errors import ConfigError
+from torchblur.ops.gather import gather, lookup, pixel_grid
+
+
+def tap(index, count, inputs, options):
+    x, y = pixel_grid(inputs["image"])
+    color = lookup(inputs["image"], x + index * inputs["step"], y, options)
+    weight = torch.exp(-inputs["decay"] * index / count)
+    return weight * color, weight.expand_as(color[:, :1])
+
+
+def unrolled(inputs, num_samples, options):
+    parts = [
+        tap(
+            torch.tensor(float(i), dtype=inputs["image"].dtype),
+            torch.tensor(float(num_samples)),
+            inputs,
+            options,
+        )
+        for i in range(num_samples)
+    ]
+    return tuple(sum(p) for p in zip(*parts, strict=True))
+
+
+def make_inputs(dtype=torch.float64):
+    return {
+        "image": torch.rand(2, 3, 5, 9, dtype=dtype),
+        "step": torch.tensor(0.37, dtype=dtype),
+        "decay": torch.rand(2, 1, 1, 1, dtype=dtype) + 0.5,
+    }
+
+
+@pytest.mark.parametrize("mode", ["nearest", "bilinear"])
+def test_gather_equals_the_unrolled_sum_and_its_gradient(mode):
+    inputs = make_inputs()
+    results = []
+    for run in (lambda i: gather(tap, mode, 6, i), lambda i: unrolled(i, 6, mode)):
+        leaves = {k: v.clone().requires_grad_() for k, v in inputs.items()}
+        color, weight = run(leaves)
+        (color / weight).square().sum().backward()
+        grads = [v.grad if v.grad is not None else torch.zeros_like(v) for v in leaves.values()]
+        results.append([color, weight, *grads])
+    for ours, theirs in zip(*results, strict=True):
+        assert torch.allclose(ours, theirs, atol=1e-10)
+
+
+def test_only_what_needs_a_gradient_gets_one():
+    inputs = make_inputs()
+    inputs["decay"].requires_grad_()
+    color, _ = gather(tap, "nearest", 4, inputs)
+    color.sum().backward()
+    assert inputs["decay"].grad is not None
+    assert inputs["image"].grad is None
+    with torch.no_grad():
+        assert not gather(tap, "nearest", 4, inputs)[0].requires_grad
+
+
+def test_unknown_engine():
+    with pytest.raises(ConfigError, match="`engine` must be 'eager' or 'compiled', got 'fast'"):
+        gather(tap, "nearest", 4, make_inputs(), "fast")
+
+
+@pytest.mark.parametrize("mode", ["nearest", "bilinear"])
+def test_lookup_replicates_the_border(mode):
+    texture = torch.arange(12.0).view(1, 1, 3, 4)
+    x = torch.tensor([-5.0, 0, 3, 9]).view(1, 1, 1, 4)
+    y = torch.tensor([-2.0, 1, 7]).view(1, 1, 3, 1)
+    read = lookup(texture, x, y, mode)[0, 0]
+    assert torch.allclose(read, torch.tensor([[0.0, 0, 3, 3], [4, 4, 7, 7], [8, 8, 11, 11]]))
+
+
+def test_lookup_of_a_batch_with_positions_of_one():
+    texture = torch.rand(3, 2, 4, 5)
+    x, y = pixel_grid(texture)
+    assert torch.equal(lookup(texture, x, y), texture)
+
+
+_NO_COMPILER = """
+import warnings, torch
+import torch._inductor.compile_fx
+from torch._inductor.exc import InductorError
+import torchblur.ops.gather as module
+
+def broken(*_, **__):
+    def call(*_, **__):
+        raise InductorError(RuntimeError("no C++ compiler"), None)
+    return call
+
+torch.compile = broken
+from torchblur.filters import get_filter
+from torchblur.testing.frames import moving_square
+frame = moving_square()
+with warnings.catch_warnings(record=True) as caught:
+    warnings.simplefilter("always")
+    blur = get_filter("line")(engine="compiled")
+    images = [blur(frame) for _ in range(3)]
+assert torch.equal(images[0], get_filter("line")()(frame))
+texts = [str(w.message) for w in caught if "torch.compile does not work here" in str(w.message)]
+assert len(texts) == 1, texts
+"""
+
+
+def test_without_a_compiler_there_is_one_notice_and_the_eager_result():
+    done = subprocess.run(
+        [sys.executable, "-c", _NO_COMPILER], capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr

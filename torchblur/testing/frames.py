@@ -1,0 +1,91 @@
+"""Small frames for tests: random ones, and scenes in which a given weight must act."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from torchblur.frame import Frame
+
+__all__ = ["constant_motion", "moving_square", "random_frame"]
+
+
+def random_frame(
+    height: int = 23,
+    width: int = 31,
+    *,
+    batch_size: int = 1,
+    speed: float = 12.0,
+    seed: int = 0,
+    dtype: torch.dtype = torch.float32,
+) -> Frame:
+    """Return a frame of noise: color in [0, 1], depth in [1, 3], blocks of random velocity.
+
+    Args:
+        height: H in px; sizes that no tile divides are the useful ones.
+        width: W in px.
+        batch_size: B.
+        speed: Standard deviation of the velocity, px/frame.
+        seed: Another frame for another seed.
+        dtype: Floating type of all layers.
+    """
+    generator = torch.Generator().manual_seed(seed)
+
+    def uniform(channels: int, h: int = height, w: int = width) -> Tensor:
+        return torch.rand(batch_size, channels, h, w, generator=generator, dtype=dtype)
+
+    coarse = torch.randn(batch_size, 2, 5, 7, generator=generator, dtype=dtype) * speed
+    velocity = torch.nn.functional.interpolate(coarse, (height, width), mode="nearest")
+    velocity = velocity + 0.1 * torch.randn(velocity.shape, generator=generator, dtype=dtype)
+    depth = torch.nn.functional.interpolate(uniform(1, 4, 6), (height, width), mode="nearest")
+    return Frame(color=uniform(3), velocity=velocity, depth=1 + 2 * depth)
+
+
+def constant_motion(
+    velocity: tuple[float, float], height: int = 24, width: int = 40, *, seed: int = 0
+) -> Frame:
+    """Return a frame of noise at one depth that moves as a whole, velocity in px/frame."""
+    generator = torch.Generator().manual_seed(seed)
+    motion = torch.tensor(velocity).view(1, 2, 1, 1).expand(1, 2, height, width)
+    color = torch.rand(1, 3, height, width, generator=generator)
+    return Frame(color=color, velocity=motion, depth=torch.full_like(color[:, :1], 5.0))
+
+
+def moving_square(
+    height: int = 21,
+    width: int = 27,
+    *,
+    velocity: tuple[float, float] = (14.0, 3.0),
+    background: tuple[float, float] = (-3.0, 5.0),
+    depths: tuple[float, float] = (2.0, 2.6),
+    dtype: torch.dtype = torch.float32,
+) -> Frame:
+    """Return a textured square that moves before a textured background that moves otherwise.
+
+    Depths lie close together and the directions differ, so that depth, direction, cone and
+    cylinder weights are all partly open; the left quarter of the background is slow. Each
+    parameter of a filter has something to act on.
+
+    Args:
+        height: H in px.
+        width: W in px.
+        velocity: Of the square, px/frame.
+        background: Of the background, px/frame.
+        depths: Of square and background, scene units.
+        dtype: Floating type of all layers.
+    """
+    generator = torch.Generator().manual_seed(7)
+    inside = torch.zeros(1, 1, height, width, dtype=torch.bool)
+    inside[..., height // 4 : 3 * height // 4, width // 4 : 3 * width // 4] = True
+
+    def plane(front: float, back: float) -> Tensor:
+        return torch.where(
+            inside, torch.tensor(front, dtype=dtype), torch.tensor(back, dtype=dtype)
+        )
+
+    color = torch.rand(1, 3, height, width, generator=generator, dtype=dtype)
+    motion = torch.cat([plane(f, b) for f, b in zip(velocity, background, strict=True)], 1)
+    motion[..., : width // 4] *= 0.4
+    wobble = torch.randn(motion.shape, generator=generator, dtype=dtype)
+    grain = torch.rand(1, 1, height, width, generator=generator, dtype=dtype)
+    return Frame(color=color, velocity=motion + 0.7 * wobble, depth=plane(*depths) + 0.3 * grain)
