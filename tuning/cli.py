@@ -1,0 +1,26 @@
+"""Entry point of the command `torchblur`.
+
+It imports nothing but the standard library, so that a missing package is one clear sentence.
+"""
+
+from __future__ import annotations
+
+import sys
+
+__all__ = ["main"]
+
+_NEEDED = ("typer", "rich")
+
+
+def main() -> None:
+    """Run the command line; exit codes are 0, 1 (something failed), 2 (bad input), 130 (Ctrl-C)."""
+    try:
+        from tuning.commands import app
+    except ModuleNotFoundError as error:
+        if error.name not in _NEEDED:
+            raise
+        sys.exit(
+            f"error: the command line needs the package `{error.name}`, which is not installed; "
+            "install it with: pip install 'torchblur[tune]'"
+        )
+    app(prog_name="torchblur")

@@ -1,0 +1,225 @@
+"""How results look in a terminal: parameters, findings about a file, plans, outcomes."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any, get_args
+
+from rich.console import Group
+from rich.padding import Padding
+from rich.table import Table
+from rich.text import Text
+
+from torchblur.filters import BlurFilter, get_filter, registered_filters
+from torchblur.io import Inspection
+from torchblur.io.inspect import ChannelInfo
+from torchblur.params import Param, choices, declared
+from tuning.batch import BatchResult, Plan
+from tuning.console import log, metrics_table, plain_table, print_error, print_warning, results
+from tuning.outputs import State
+from tuning.result import FitResult
+
+__all__ = [
+    "print_batch",
+    "print_fit",
+    "print_inspection",
+    "print_parameters",
+    "print_plan",
+    "schema_text",
+]
+
+_WIDE = 150
+_SCORES = ("flip", "psnr", "ssim", "flip_band", "psnr_band", "ssim_band")
+_SHOWN = ("sharp", "line", "default", "tuned", "ceiling", "noise")
+
+
+# -- parameters --------------------------------------------------------------------------------
+
+
+def print_parameters(filter_name: str | None = None) -> None:
+    """Print the declared parameters of a filter, or of all.
+
+    Raises:
+        ConfigError: unknown filter.
+    """
+    filters = (
+        registered_filters() if filter_name is None else {filter_name: get_filter(filter_name)}
+    )
+    for name, kind in filters.items():
+        summary = (kind.__doc__ or "").strip().splitlines()[0]
+        results.print(Text.assemble((name, "bold"), f"  {kind.__name__}: {summary}"))
+        results.print(_parameters(kind))
+
+
+def schema_text(filter_name: str | None = None) -> str:
+    """Return the JSON Schema of a filter's parameters, or of all filters by name.
+
+    Raises:
+        ConfigError: unknown filter.
+    """
+    if filter_name is not None:
+        schema: Any = get_filter(filter_name).config_class.model_json_schema()
+    else:
+        schema = {n: f.config_class.model_json_schema() for n, f in registered_filters().items()}
+    return json.dumps(schema, indent=2, ensure_ascii=False)
+
+
+def _parameters(kind: type[BlurFilter]) -> Any:
+    specs, default = declared(kind.config_class), kind.config_class()
+    values = {name: _plain(getattr(default, name)) for name in specs}
+    if results.width < _WIDE:
+        return Group(*(_entry(kind, name, spec, values[name]) for name, spec in specs.items()))
+    columns = ("name", "", "default", "range", "unit", "scale", "gradient", "meaning", "source")
+    table = plain_table("", columns, right=("default",))
+    for name, spec in specs.items():
+        scale = spec.scale if spec.low is not None else ""
+        unit = "" if spec.unit == "1" else spec.unit
+        cells = (name, spec.symbol, values[name], _range(kind, name, spec), unit, scale)
+        table.add_row(*map(Text, (*cells, spec.grad, spec.meaning, spec.source)))
+    return table
+
+
+def _entry(kind: type[BlurFilter], name: str, spec: Param, default: str) -> Any:
+    """Return a parameter as a paragraph, for narrow terminals."""
+    symbol = f" ({spec.symbol})" if spec.symbol else ""
+    unit = "" if spec.unit == "1" else f" {spec.unit}"
+    scale = " log" if spec.scale == "log" else ""
+    head = Text.assemble(
+        (f"{name}{symbol}", "bold cyan"),
+        f" = {default}",
+        (f"   {_range(kind, name, spec)}{unit}{scale}, {spec.grad}", "green"),
+    )
+    text = Text.assemble(spec.meaning, (f"  {spec.source}", "dim"))
+    return Group(Padding(head, (0, 0, 0, 2)), Padding(text, (0, 0, 0, 6)))
+
+
+def _range(kind: type[BlurFilter], name: str, spec: Param) -> str:
+    if spec.low is not None:
+        low, high = spec.bounds
+        return f"[{low:g}, {high:g}]"
+    return " | ".join(_plain(value) for value in choices(kind.config_class, name))
+
+
+def _plain(value: object) -> str:
+    """Return a value as YAML has it."""
+    if isinstance(value, bool):
+        return str(value).lower()
+    return f"{value:g}" if isinstance(value, float) else str(value)
+
+
+# -- a file ------------------------------------------------------------------------------------
+
+
+def print_inspection(found: Inspection) -> None:
+    """Print what was found about a file; warnings last, where they are seen."""
+    results.print(Text(found.path, style="bold"), soft_wrap=True)
+    for part in found.parts:
+        name = f"part {part.name}, " if part.name else ""
+        view = f"view {part.view}, " if part.view else ""
+        window = part.data_window
+        size = f"{window.width}x{window.height} px, {part.compression}"
+        results.print(f"{name}{view}{size}", markup=False)
+        results.print(_channels(part.channels))
+    for name, text in _facts(found):
+        results.print(Text.assemble((f"{name:<18}", "bold"), text), soft_wrap=True)
+    if found.signs:
+        _print_signs(found)
+    for note in found.notes:
+        results.print(Text(f"note: {note}"), soft_wrap=True)
+    for warning in found.warnings:
+        print_warning(warning)
+    if not found.warnings:
+        results.print(Text("nothing looks wrong", style="green"))
+
+
+def _channels(channels: Sequence[ChannelInfo]) -> Table:
+    has_bad = any(c.num_nan or c.num_inf for c in channels)
+    columns = ["channel", "type", "least", "mean", "greatest", *(["NaN", "inf"] * has_bad)]
+    table = plain_table("", columns, right=columns[2:])
+    for c in channels:
+        numbers = [Text(f"{value:.4g}") for value in (c.minimum, c.mean, c.maximum)]
+        bad = [Text(str(n) if n else "", style="bold red") for n in (c.num_nan, c.num_inf)]
+        table.add_row(Text(c.name), c.type, *numbers, *(bad if has_bad else []))
+    return table
+
+
+def _facts(found: Inspection) -> Iterable[tuple[str, str]]:
+    if found.convention:
+        yield "convention", f"{found.convention} (known from: {found.evidence})"
+    for role, channels in found.recognized.items():
+        yield role, ", ".join(channels)
+    if found.velocity is not None:
+        speed = found.velocity
+        yield (
+            "speed",
+            f"{speed.moving_share:.1%} of the pixels move: median {speed.median:.1f}, 95 % "
+            f"{speed.percentile_95:.1f}, greatest {speed.maximum:.1f} px/frame",
+        )
+    if found.metadata:
+        yield "metadata", json.dumps(dict(found.metadata), ensure_ascii=False)
+
+
+def _print_signs(found: Inspection) -> None:
+    table = plain_table("match with the reference", ["velocity", "PSNR dB"], right=["PSNR dB"])
+    for match in found.signs:
+        table.add_row(Text(match.change), f"{match.psnr:.2f}")
+    results.print(table)
+
+
+# -- batch runs --------------------------------------------------------------------------------
+
+
+def print_plan(plan: Plan) -> None:
+    """Print what a batch run would do, a line per frame."""
+    for job, state in plan.states:
+        what = {"to do": "make", "done": "skip", "out of date": "redo", "other": "REFUSE"}[state]
+        what = "redo" if plan.overwrite and state != "to do" else what
+        results.print(Text(f"{what:<6} {job.source} -> {job.output}"), soft_wrap=True)
+    counts = [f"{n} {state}" for state in get_args(State) if (n := plan.count(state))]
+    results.print(f"{len(plan.states)} frames: {', '.join(counts)}")
+
+
+def print_batch(plan: Plan, result: BatchResult) -> None:
+    """Print what became of a batch run; frames that failed last, each with its reason."""
+    total = len(plan.states)
+    skipped = f", {result.skipped} done before" if result.skipped else ""
+    results.print(f"{len(result.written)} of {total} frames written{skipped}")
+    for failure in result.failures:
+        print_error(f"{failure.job.source}: {failure.reason}")
+    if result.failures:
+        log(f"{len(result.failures)} of {total} frames failed; the same command tries them again")
+    if result.interrupted:
+        left = total - result.skipped - len(result.written) - len(result.failures)
+        print_error(f"stopped (Ctrl-C) with {left} frames left; the same command goes on")
+
+
+# -- fits --------------------------------------------------------------------------------------
+
+
+def print_fit(result: FitResult, folder: Path) -> None:
+    """Print a fit's figures on training frames and hold-out, its parameters, and its files."""
+    for split, title in (("train", "training frames"), ("holdout", "hold-out")):
+        rows = {name: _means(result, name, split) for name in _SHOWN if name in result.variants()}
+        rows = {name: row for name, row in rows.items() if row["flip"] == row["flip"]}
+        if rows:
+            results.print(metrics_table(title, rows, highlight="tuned"))
+    table = plain_table("parameters", ["", "default", "tuned", "unit"], right=["default", "tuned"])
+    for row in result.parameters:
+        unit = "" if row.unit == "1" else row.unit
+        table.add_row(Text(row.name), _plain_short(row.default), _plain_short(row.tuned), unit)
+    results.print(table)
+    for note in result.notes:
+        log(f"note: {note}")
+    results.print(f"preset: {folder / 'preset.yaml'}", soft_wrap=True)
+    results.print(f"report: {folder / 'report.html'}", soft_wrap=True)
+
+
+def _means(result: FitResult, variant: str, split: str) -> dict[str, float]:
+    means = {key: result.mean(variant, split, key) for key in _SCORES}
+    return {key: float("nan") if value is None else value for key, value in means.items()}
+
+
+def _plain_short(value: Any) -> str:
+    return f"{value:.4g}" if isinstance(value, float) else _plain(value)

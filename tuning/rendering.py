@@ -1,0 +1,161 @@
+"""Rendering sequences of a procedural scene to files: sharp frames, and references beside them."""
+
+from __future__ import annotations
+
+import hashlib
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from pydantic import Field
+
+from torchblur.errors import ConfigError, OutputError, nearest_name
+from torchblur.frame import Shutter, ShutterPosition
+from torchblur.io import write_frame, write_image
+from torchblur.params import Config, build
+from torchblur.render import Scene, load_scene, render_frame, render_reference
+from tuning.outputs import made_by, make_folders, remove_leftovers, state_of
+from tuning.progress import Progress, Stage
+
+__all__ = ["RenderSettings", "find_scene", "render_sequence", "settings_of"]
+
+_PLACES = (Path("configs/scenes"), Path(__file__).resolve().parents[1] / "configs/scenes")
+
+
+class RenderSettings(Config):
+    """How a scene is rendered."""
+
+    width: int = Field(640, ge=1, le=16384, description="px")
+    height: int = Field(360, ge=1, le=16384, description="px")
+    frames: int = Field(1, ge=1, description="number of frames, from time 0 on")
+    spp: int = Field(256, ge=2, description="samples per pixel of the reference")
+    color_spp: int = Field(16, ge=1, description="samples per pixel of the sharp color")
+    shutter: float = Field(0.5, ge=0, le=2, description="open time as a fraction of a frame")
+    shutter_position: ShutterPosition = "centered"
+    seed: int = Field(0, ge=0, description="of frame 0; each frame has the next")
+
+
+@dataclass(frozen=True)
+class _Task:
+    """One file of a frame."""
+
+    kind: str
+    number: int
+    path: Path
+    recipe: Mapping[str, Any]
+
+
+def settings_of(size: str, **values: Any) -> RenderSettings:
+    """Return render settings from "WIDTHxHEIGHT" and other fields.
+
+    Raises:
+        ConfigError: a size that is none, or a value out of range.
+    """
+    match = re.fullmatch(r"(\d+)x(\d+)", size)
+    if match is None:
+        raise ConfigError(f"`size` must be WIDTHxHEIGHT in px, such as 640x360, got {size!r}")
+    width, height = int(match[1]), int(match[2])
+    return build(RenderSettings, {"width": width, "height": height, **values})
+
+
+def find_scene(scene: str) -> Path:
+    """Return the file of a scene.
+
+    Args:
+        scene: A path, or the name of a scene in `configs/scenes`.
+
+    Raises:
+        ConfigError: there is none; names the nearest.
+    """
+    if Path(scene).is_file():
+        return Path(scene)
+    known = {path.stem: path for place in _PLACES for path in sorted(place.glob("*.yaml"))}
+    if scene not in known:
+        hint = nearest_name(scene, known)
+        names = f"; scenes: {', '.join(sorted(known))}" if known else ""
+        raise ConfigError(f"no scene `{scene}`{hint}{names}; or give the path of a YAML file")
+    return known[scene]
+
+
+def render_sequence(
+    path: Path,
+    folder: Path,
+    settings: RenderSettings,
+    *,
+    overwrite: bool = False,
+    progress: Progress | None = None,
+) -> list[Path]:
+    """Render a scene to `NAME.####.exr` and `reference.####.exr`; files that are done are kept.
+
+    The number in the names is the time in frames. A sharp frame has all layers; a reference has
+    the layer `variance`, the variance of its mean.
+
+    Args:
+        path: File of the scene; its stem is NAME.
+        folder: Where to.
+        settings: Size, samples, shutter, seed.
+        overwrite: Replace files made with other settings.
+        progress: Told after each file.
+
+    Returns:
+        All files of the sequence, in order.
+
+    Raises:
+        ConfigError: the file is no scene.
+        OutputError: files with other content are in the way, or the folder cannot be written to.
+    """
+    scene = load_scene(path)
+    tasks = _tasks(path, scene, folder, settings)
+    states = {task.path: state_of(task.path, (), task.recipe) for task in tasks}
+    other = [file for file, state in states.items() if state == "other"]
+    if other and not overwrite:
+        raise OutputError(
+            f"{other[0]} exists and was made with other settings; overwrite=True (--overwrite) "
+            "replaces it"
+        )
+    todo = [task for task in tasks if overwrite or states[task.path] != "done"]
+    make_folders([folder])
+    remove_leftovers([task.path for task in todo])
+    stage = Stage("render", len(todo), progress)
+    for done, task in enumerate(todo, start=1):
+        _render(task, scene, settings, made_by(task.recipe, path))
+        stage.step(done, message=task.path.name)
+    return [task.path for task in tasks]
+
+
+def _tasks(path: Path, scene: Scene, folder: Path, settings: RenderSettings) -> list[_Task]:
+    digest = hashlib.sha256(scene.model_dump_json().encode()).hexdigest()[:16]
+    common = {"scene": digest} | settings.model_dump(mode="json", exclude={"frames"})
+    return [
+        _Task(
+            kind=kind,
+            number=number,
+            path=folder / f"{path.stem if kind == 'frame' else kind}.{number:04d}.exr",
+            recipe=common | {"kind": kind, "frame": number},
+        )
+        for number in range(settings.frames)
+        for kind in ("frame", "reference")
+    ]
+
+
+def _render(
+    task: _Task, scene: Scene, settings: RenderSettings, metadata: Mapping[str, Any]
+) -> None:
+    size = (settings.height, settings.width)
+    seed = settings.seed + task.number
+    if task.kind == "frame":
+        frame = render_frame(
+            scene, size, frame=task.number, color_spp=settings.color_spp, seed=seed
+        )
+        write_frame(task.path, frame, metadata=metadata, overwrite=True)
+        return
+    shutter = Shutter(settings.shutter, settings.shutter_position)
+    result = render_reference(
+        scene, size, spp=settings.spp, shutter=shutter, frame=task.number, seed=seed
+    )
+    layers = {"variance": result.variance}
+    write_image(
+        task.path, result.mean, layers=layers, half=False, metadata=metadata, overwrite=True
+    )
