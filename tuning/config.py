@@ -1,0 +1,457 @@
+"""What a fit is told: filter, data, objective, methods; one YAML file.
+
+Every mistake is one `ConfigError` with the file and the key path. Paths under `data` are relative
+to `data.root`, which is relative to the file itself; `filter.kind` may be a preset's path, relative
+to the file too.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import Field, create_model, field_validator
+from pydantic_core import PydanticCustomError
+from ruamel.yaml import YAML
+from ruamel.yaml.error import YAMLError
+
+from torchblur.errors import ConfigError, nearest_name
+from torchblur.filters import get_filter, registered_filters
+from torchblur.frame import Shutter, ShutterPosition
+from torchblur.io import load_yaml
+from torchblur.ops.gather import Engine
+from torchblur.params import Config, build, choices, declared
+from torchblur.presets import load_preset
+
+__all__ = [
+    "BlackBoxMethod",
+    "Crops",
+    "DataItem",
+    "DataSpec",
+    "ExrData",
+    "FilterSpec",
+    "FreeRange",
+    "GradientMethod",
+    "Method",
+    "ObjectiveSpec",
+    "SceneData",
+    "TuneConfig",
+    "apply_overrides",
+    "free_names",
+    "load_tune_config",
+    "resolve",
+]
+
+_SHUTTER_KEYS = ("shutter", "shutter_position")
+
+
+class FreeRange(Config):
+    """Where a free parameter may lie; the declared range if nothing is given."""
+
+    low: float | None = Field(None, description="least value, included")
+    high: float | None = Field(None, description="greatest value, included")
+    choices: tuple[bool | int | float | str, ...] | None = Field(
+        None, min_length=1, description="values to choose from; for integers, switches, choices"
+    )
+
+
+class FilterSpec(Config):
+    """The filter, what is fixed, and what is free."""
+
+    kind: str = Field(description="registered name of a filter, or the path of a preset")
+    params: dict[str, Any] = Field(
+        default_factory=dict, description="fixed values; of free ones, where the fit starts"
+    )
+    free: dict[str, FreeRange] = Field(
+        min_length=1, description="names of the free parameters, or a mapping name: {low, high}"
+    )
+
+    @field_validator("free", mode="before")
+    @classmethod
+    def _names_to_mapping(cls, value: Any) -> Any:
+        if isinstance(value, (list, tuple)):
+            return {str(name): {} for name in value}
+        if isinstance(value, dict):
+            return {name: {} if item is None else item for name, item in value.items()}
+        return value
+
+
+class _Exposed(Config):
+    shutter: Annotated[float, Field(ge=0, le=2)] = Field(
+        0.5, description="open time as a fraction of a frame"
+    )
+    shutter_position: ShutterPosition = Field(
+        "centered", description="open around the frame's time, after it, or before it"
+    )
+
+    @property
+    def exposure(self) -> Shutter:
+        """The shutter of the reference."""
+        return Shutter(self.shutter, self.shutter_position)
+
+
+class SceneData(_Exposed):
+    """Frames of a procedural scene, rendered by torchblur and cached."""
+
+    kind: Literal["scene"]
+    path: str = Field(description="scene file")
+    size: str = Field("320x180", description="WIDTHxHEIGHT in px")
+    frames: tuple[float, ...] = Field((0.0,), min_length=1, description="times, in frames")
+    spp: int = Field(256, ge=2, description="samples per pixel of the reference")
+    color_spp: int = Field(16, ge=1, description="samples per pixel of the sharp color")
+    seed: int = Field(0, ge=0, description="seed of the renderer")
+
+    @field_validator("size")
+    @classmethod
+    def _is_size(cls, value: str) -> str:
+        parts = value.split("x")
+        if len(parts) != 2 or not all(p.isdigit() and int(p) > 0 for p in parts):
+            raise PydanticCustomError(
+                "nested", "{text}", {"text": f"`size` must be WIDTHxHEIGHT in px, got {value!r}"}
+            )
+        return value
+
+    @property
+    def height_width(self) -> tuple[int, int]:
+        """Height and width in px."""
+        width, height = (int(part) for part in self.size.split("x"))
+        return height, width
+
+
+class ExrData(_Exposed):
+    """Frames of another renderer, as EXR files in one folder."""
+
+    kind: Literal["exr"]
+    path: str = Field(".", description="folder")
+    sharp: str = Field("sharp.exr", description="sharp render; #### stands for the frame number")
+    gbuffer: str | None = Field(
+        None, description="file with depth, velocity … if they are not in the sharp render's"
+    )
+    reference: str = Field("reference.exr", description="render with motion blur")
+    convention: str = Field("auto", description="whose channel names and signs")
+    frames: tuple[int, ...] | None = Field(
+        None, min_length=1, description="frame numbers for ####; all that are there if left out"
+    )
+
+
+DataItem = Annotated[SceneData | ExrData, Field(discriminator="kind")]
+
+
+class Crops(Config):
+    """Windows to fit on, instead of full frames; more of them where something moves."""
+
+    size: int = Field(128, ge=16, description="edge of the scored window, px")
+    per_frame: int = Field(4, ge=1, description="windows of each frame")
+    context: int | None = Field(
+        None,
+        ge=0,
+        description="px around it that are filtered and not scored; twice the tile if left out",
+    )
+
+
+class DataSpec(Config):
+    """What is fitted, and what the fit never sees. Split by scene, never by crop."""
+
+    root: str = Field(".", description="folder that the paths below are relative to")
+    train: tuple[DataItem, ...] = Field(min_length=1, description="frames to fit")
+    holdout: tuple[DataItem, ...] = Field((), description="frames for the evaluation alone")
+    crops: Crops | None = Field(None, description="fit on windows; on full frames if left out")
+
+
+Metric = Literal["flip", "flip_hdr", "l1", "mse", "relative_l2", "ssim"]
+
+
+def _flip_alone() -> dict[Metric, float]:
+    return {"flip": 1.0}
+
+
+class ObjectiveSpec(Config):
+    """A weighted sum of error maps, averaged over the image and over the band at moving borders."""
+
+    terms: dict[Metric, Annotated[float, Field(gt=0)]] = Field(
+        default_factory=_flip_alone,
+        min_length=1,
+        description="weights; flip and flip_hdr have a color space of their own, ssim is 1 - SSIM",
+    )
+    color_space: Literal["linear", "srgb", "log"] = Field(
+        "srgb",
+        description="of l1, mse, relative_l2: radiance, clipped and sRGB-encoded, or log(1 + x)",
+    )
+    band_weight: float = Field(
+        0.0, ge=0, le=1, description="share of the band at moving borders; the rest is the image"
+    )
+
+
+class _MethodBase(Config):
+    free: tuple[str, ...] | None = Field(
+        None, min_length=1, description="the free parameters that this method fits; all if left out"
+    )
+    continue_from_best: bool = Field(
+        False, description="begin at the best of the methods before it, beside the start values"
+    )
+
+
+class GradientMethod(_MethodBase):
+    """Adam in the unit cube, from several starts at once; for smooth parameters."""
+
+    kind: Literal["gradient"]
+    steps: int = Field(100, ge=1, description="steps of the optimizer")
+    starts: int = Field(4, ge=1, description="the first at the start values, the others random")
+    learning_rate: float = Field(
+        0.03, gt=0, le=1, description="first step, as a fraction of each range; falls by a cosine"
+    )
+    batch: int | None = Field(
+        None, ge=1, description="frames or windows of a step, drawn anew; all if left out"
+    )
+
+
+class BlackBoxMethod(_MethodBase):
+    """An Optuna sampler; for parameters of every class."""
+
+    kind: Literal["blackbox"]
+    sampler: Literal["tpe", "cmaes", "gp", "random"] = Field("tpe", description="Optuna's sampler")
+    trials: int = Field(100, ge=1, description="evaluations; the first at the start values")
+
+
+Method = Annotated[GradientMethod | BlackBoxMethod, Field(discriminator="kind")]
+
+
+class TuneConfig(Config):
+    """One fit: `torchblur tune CONFIG`."""
+
+    filter: FilterSpec
+    data: DataSpec
+    objective: ObjectiveSpec = Field(default_factory=ObjectiveSpec)
+    methods: tuple[Method, ...] = Field(
+        default_factory=lambda: (GradientMethod(kind="gradient"),),
+        min_length=1,
+        description="run in this order; the best on the training frames becomes the preset",
+    )
+    ceiling_steps: int = Field(
+        0,
+        ge=0,
+        description="gradient steps for the best parameters of each single frame; 0: leave it out",
+    )
+    seed: int = Field(0, ge=0, description="of starts, windows, batches and samplers")
+    device: str = Field("auto", description="auto, cpu, cuda, cuda:1 …")
+    engine: Engine = Field("eager", description="eager, or compiled taps")
+
+
+def load_tune_config(path: str | Path, overrides: Sequence[str] = ()) -> TuneConfig:
+    """Read a configuration and check all of it.
+
+    Args:
+        path: A YAML file.
+        overrides: "key.path=value", value in YAML: ``seed=3``, ``data.root=/frames``,
+            ``methods.0.steps=50``. A `data.root` given here is relative to the working folder.
+
+    Returns:
+        The configuration with absolute paths and without reference to a preset.
+
+    Raises:
+        ConfigError: each mistake in a line, with file and key path.
+        FileFormatError: no such file.
+    """
+    path = Path(path)
+    data = apply_overrides(load_yaml(path), overrides)
+    config = build(TuneConfig, data, str(path))
+    own_root = any(text.startswith("data.root=") for text in overrides)
+    return resolve(config, str(path), path.parent, Path.cwd() if own_root else None)
+
+
+def apply_overrides(data: Mapping[str, Any], overrides: Sequence[str]) -> dict[str, Any]:
+    """Return nested data with single values replaced.
+
+    Args:
+        data: As a YAML file gives it; left as it is.
+        overrides: "key.path=value"; positions in lists count from 0.
+
+    Raises:
+        ConfigError: not of this form, or the path leads through a value or past a list's end.
+    """
+    result: Any = YAML(typ="safe", pure=True).load("{}") | _copied(data)
+    for text in overrides:
+        keys, equals, value = text.partition("=")
+        if not equals or not keys:
+            raise ConfigError(f"an override must be KEY.PATH=VALUE, got {text!r} (--set)")
+        try:
+            parsed = YAML(typ="safe", pure=True).load(value)
+        except YAMLError as error:
+            raise ConfigError(f"the value of {text!r} is not YAML (--set)") from error
+        _put(result, keys.split("."), parsed, text)
+    return dict(result)
+
+
+def resolve(
+    config: TuneConfig, place: str = "", folder: Path | None = None, root_folder: Path | None = None
+) -> TuneConfig:
+    """Check what spans several keys, make paths absolute, and replace a preset by its content.
+
+    Args:
+        config: A configuration; an already resolved one comes back equal.
+        place: Name for messages.
+        folder: What relative paths are relative to; the working folder if left out.
+        root_folder: The same for `data.root` alone, if it differs.
+
+    Raises:
+        ConfigError: unknown filter or parameter, value out of range, a gradient fit of a
+            parameter without a gradient.
+    """
+    folder = Path.cwd() if folder is None else folder
+    filter_spec = _without_preset(config.filter, place, folder)
+    filter_spec = _checked_params(filter_spec, place)
+    for name, limits in filter_spec.free.items():
+        _check_range(filter_spec, name, limits, f"{place}: " if place else "")
+    root = str(((root_folder or folder) / config.data.root).resolve())
+    config = config.model_copy(
+        update={"filter": filter_spec, "data": config.data.model_copy(update={"root": root})}
+    )
+    for index in range(len(config.methods)):
+        free_names(config, index, place)
+    return config
+
+
+def free_names(config: TuneConfig, index: int, place: str = "") -> tuple[str, ...]:
+    """Return the parameters that a method fits, or refuse those that it cannot.
+
+    A gradient method takes smooth parameters. It refuses discrete ones always; weak ones, whose
+    gradient is zero or biased, unless the method itself names them in its `free`.
+
+    Args:
+        config: The configuration.
+        index: Position in `methods`.
+        place: Name for messages.
+
+    Raises:
+        ConfigError: unknown name, or one without a usable gradient.
+    """
+    method = config.methods[index]
+    where = f"({place}: methods.{index}.free)" if place else f"(methods.{index}.free)"
+    names = tuple(config.filter.free) if method.free is None else method.free
+    specs = declared(get_filter(config.filter.kind).config_class)
+    for name in names:
+        if name not in config.filter.free:
+            hint = nearest_name(name, config.filter.free)
+            raise ConfigError(f"`{name}` is not among the free parameters{hint} {where}")
+        grad = specs[name].grad
+        if method.kind == "gradient" and (
+            grad == "discrete" or (grad == "weak" and not method.free)
+        ):
+            raise ConfigError(
+                f"`{name}` is {grad} and has no usable gradient; fit it with a `blackbox` method, "
+                f"and name this method's own parameters in its `free` {where}"
+            )
+    return names
+
+
+# -- checks ----------------------------------------------------------------------------------------
+
+
+def _without_preset(spec: FilterSpec, place: str, folder: Path) -> FilterSpec:
+    if spec.kind in registered_filters():
+        return spec
+    if not spec.kind.endswith((".yaml", ".yml")):
+        try:
+            get_filter(spec.kind)
+        except ConfigError as error:
+            raise ConfigError(f"{error} ({_join(place, 'filter.kind')})") from error
+    preset = load_preset(folder / spec.kind)
+    params = {k: v for k, v in preset.params.items() if k not in _SHUTTER_KEYS}
+    return spec.model_copy(update={"kind": preset.filter, "params": params | spec.params})
+
+
+def _checked_params(spec: FilterSpec, place: str) -> FilterSpec:
+    """Build the filter's own config where it stands in the file, so that errors name the place."""
+    for key in _SHUTTER_KEYS:
+        if key in spec.params and key not in spec.free:
+            raise ConfigError(
+                f"`{key}` belongs to the items under data, which know how their references were "
+                f"made; or name it under filter.free ({_join(place, f'filter.params.{key}')})"
+            )
+    inner: Any = get_filter(spec.kind).config_class
+    data: Any = spec.params
+    for key in ("params", "filter"):
+        fields: Any = {key: (inner, ...)}
+        inner, data = create_model(key, __base__=Config, **fields), {key: data}
+    build(inner, data, place)
+    return spec
+
+
+def _check_range(spec: FilterSpec, name: str, limits: FreeRange, place: str) -> None:
+    model = get_filter(spec.kind).config_class
+    specs = declared(model)
+    where = f"({place}filter.free.{name})"
+    if name not in specs:
+        raise ConfigError(
+            f"unknown parameter `{name}` of {spec.kind}{nearest_name(name, specs)} {where}"
+        )
+    numeric = specs[name].low is not None
+    narrowed = limits.low is not None or limits.high is not None
+    if narrowed and (not numeric or limits.choices):
+        raise ConfigError(f"`{name}` is given as choices and has no `low` and `high` {where}")
+    if limits.choices is not None:
+        if specs[name].grad != "discrete":
+            raise ConfigError(f"`{name}` is continuous: give `low` and `high`, not choices {where}")
+        for value in limits.choices:
+            build(model, {name: value}, f"{place}filter.free.{name}.choices")
+        return
+    if not numeric:
+        if not choices(model, name):
+            raise ConfigError(f"`{name}` needs `choices` {where}")
+        return
+    _check_narrowed(spec, name, limits, where)
+
+
+def _check_narrowed(spec: FilterSpec, name: str, limits: FreeRange, where: str) -> None:
+    declared_range = declared(get_filter(spec.kind).config_class)[name]
+    low, high = declared_range.bounds
+    new_low = low if limits.low is None else limits.low
+    new_high = high if limits.high is None else limits.high
+    if new_low < low or new_high > high:
+        raise ConfigError(
+            f"the range of `{name}` must lie within {declared_range.range_text}, "
+            f"got [{new_low:g}, {new_high:g}] {where}"
+        )
+    if not new_low < new_high:
+        raise ConfigError(
+            f"`low < high` must hold for `{name}`, got {new_low:g} and {new_high:g} {where}"
+        )
+    start = spec.params.get(name)
+    if start is not None and not new_low <= start <= new_high:
+        raise ConfigError(
+            f"`{name}` starts at {start:g}, outside its range [{new_low:g}, {new_high:g}] {where}"
+        )
+
+
+def _join(place: str, keys: str) -> str:
+    return f"{place}: {keys}" if place else keys
+
+
+# -- overrides -------------------------------------------------------------------------------------
+
+
+def _copied(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return {key: _copied(item) for key, item in value.items()}
+    return [_copied(item) for item in value] if isinstance(value, (list, tuple)) else value
+
+
+def _put(target: Any, keys: list[str], value: Any, text: str) -> None:
+    for key in keys[:-1]:
+        target = _inside(target, key, text)
+    last = keys[-1]
+    if isinstance(target, dict):
+        target[last] = value
+    else:
+        _inside(target, last, text)
+        target[int(last)] = value
+
+
+def _inside(target: Any, key: str, text: str) -> Any:
+    if isinstance(target, dict):
+        return target.setdefault(key, {})
+    if isinstance(target, list) and key.isdigit() and int(key) < len(target):
+        return target[int(key)]
+    kind = f"a list of {len(target)}" if isinstance(target, list) else f"the value {target!r}"
+    raise ConfigError(f"`{key}` leads into {kind}, got {text!r} (--set)")

@@ -1,0 +1,333 @@
+"""A run: data, methods, evaluation, preset and report, in one folder that survives a kill."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import platform
+import shlex
+import sys
+import time
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from torchblur.errors import ConfigError
+from torchblur.filters import BlurFilter, get_filter
+from torchblur.presets import Preset, save_preset
+from tuning.blackbox import BlackBoxJob, fit_blackbox
+from tuning.config import GradientMethod, TuneConfig, free_names, resolve
+from tuning.data import Case, load_cases, make_samples
+from tuning.evaluation import Variant, ceiling, score_cases, sensitivities
+from tuning.gradient import GradientJob, fit_gradient
+from tuning.problem import Problem
+from tuning.progress import Progress, ProgressEvent, Stage
+from tuning.report import write_report
+from tuning.result import CaseScore, FitResult, MethodResult, ParameterResult
+from tuning.runfolder import RunFolder, open_run
+from tuning.space import Space, make_space
+
+__all__ = ["run_fit"]
+
+_HEADLINE = ("flip", "psnr", "ssim", "flip_band", "psnr_band", "ssim_band")
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Setting:
+    """What all stages of a run share."""
+
+    config: TuneConfig
+    folder: RunFolder
+    progress: Progress | None
+    space: Space
+    blur: BlurFilter
+    cases: list[Case]
+    problem: Problem
+    notes: tuple[str, ...]
+
+
+def run_fit(
+    config: TuneConfig,
+    output_dir: str | Path,
+    resume: bool = False,
+    progress: Progress | None = None,
+    *,
+    overwrite: bool = False,
+) -> FitResult:
+    """Fit a filter's free parameters to references and write a run folder.
+
+    The folder gets `config.yaml` (resolved), `log.jsonl` (a line per step and trial), checkpoints
+    and Optuna journals, `preset.yaml` (what `torchblur filter` takes), `result.json` and
+    `report.html`. The best method is chosen on the training frames; the hold-out is only scored.
+
+    Args:
+        config: The configuration.
+        output_dir: The run folder; it must not hold a run unless `resume` or `overwrite` is on.
+        resume: Go on with a run that was stopped, with the same configuration. It ends as it
+            would have ended: bit-equal on one machine with the CPU.
+        progress: Called after each step.
+        overwrite: Remove a run that is there.
+
+    Returns:
+        All figures; `FitResult.load` reads the same from `result.json`.
+
+    Raises:
+        ConfigError: a mistake in the configuration.
+        FitError: no parameter set gives a finite loss.
+        OutputError: the folder exists, or cannot be written to.
+        TorchblurError: data that is missing or cannot be read.
+    """
+    config = resolve(config)
+    began = time.monotonic()
+    with open_run(Path(output_dir), config, resume=resume, overwrite=overwrite) as folder:
+        finished = folder.path / "result.json"
+        if finished.is_file() and (folder.path / "report.html").is_file():
+            return FitResult.load(finished)
+        setting = _prepare(config, folder, progress)
+        methods = _run_methods(setting)
+        result, variants = _evaluate(setting, methods, began)
+        _write_preset(setting, result)
+        folder.write("result.json", result.model_dump_json(indent=2))
+        stage = Stage("report", 1, progress)
+        write_report(folder, config, result, setting.cases, variants)
+        stage.step(1)
+    return result
+
+
+# -- stages ----------------------------------------------------------------------------------------
+
+
+def _prepare(config: TuneConfig, folder: RunFolder, progress: Progress | None) -> _Setting:
+    device = _device(config.device)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        cases = load_cases(config.data, device=device, report=_data_reporter(progress))
+    notes = tuple(dict.fromkeys(str(warning.message) for warning in caught))
+    if not config.data.holdout:
+        notes += ("There is no hold-out: these figures are of the frames that were fitted.",)
+    space = make_space(config.filter)
+    blur = get_filter(config.filter.kind)(engine=config.engine, **config.filter.params).to(device)
+    train = [case for case in cases if case.split == "train"]
+    tile_size = int(getattr(blur.config, "tile_size", 16))
+    samples = make_samples(train, config.data.crops, tile_size=tile_size, seed=config.seed)
+    for parameter in blur.parameters():
+        parameter.requires_grad_(False)
+    problem = Problem(blur, samples, config.objective, space.names)
+    for note in notes:
+        folder.log(note=note)
+        if progress is not None:
+            progress(ProgressEvent(stage="data", done=len(cases), total=len(cases), message=note))
+    return _Setting(
+        config=config,
+        folder=folder,
+        progress=progress,
+        space=space,
+        blur=blur,
+        cases=cases,
+        problem=problem,
+        notes=notes,
+    )
+
+
+def _run_methods(setting: _Setting) -> list[MethodResult]:
+    results: list[MethodResult] = []
+    for index, method in enumerate(setting.config.methods):
+        points: list[dict[str, Any]] = [setting.space.start()]
+        if method.continue_from_best and results:
+            points.append(min(results, key=lambda r: r.objective).params)
+        names = free_names(setting.config, index)
+        fixed = {name: value for name, value in points[-1].items() if name not in names}
+        common: dict[str, Any] = {
+            "index": index,
+            "name": _method_name(setting.config, index),
+            "space": setting.space.subset(names),
+            "fixed": fixed,
+            "first": tuple(points),
+            "seed": setting.config.seed,
+        }
+        if isinstance(method, GradientMethod):
+            gradient = GradientJob(method=method, **common)
+            result = fit_gradient(setting.problem, gradient, setting.folder, setting.progress)
+        else:
+            search = BlackBoxJob(method=method, **common)
+            result = fit_blackbox(setting.problem, search, setting.folder, setting.progress)
+        results.append(result)
+    return results
+
+
+def _evaluate(
+    setting: _Setting, methods: Sequence[MethodResult], began: float
+) -> tuple[FitResult, list[Variant]]:
+    start = setting.space.start()
+    start_objective = float(setting.problem.mean(start))
+    best = min(methods, key=lambda method: method.objective)
+    improved = best.objective < start_objective
+    tuned = best.params if improved else start
+    variants = _variants(setting, methods, tuned)
+    stage = Stage("evaluation", len(setting.cases), setting.progress)
+    scores = score_cases(setting.cases, variants, stage) + _ceiling_scores(setting, tuned)
+    rises = sensitivities(setting.problem, setting.space, tuned)
+    params = setting.config.filter.params | tuned | _common_shutter(setting)
+    result = FitResult(
+        filter=setting.config.filter.kind,
+        params=_not_default(setting.blur, params),
+        chosen=best.name if improved else "default",
+        start_objective=start_objective,
+        objective=best.objective if improved else start_objective,
+        parameters=_parameters(setting.space, tuned, rises),
+        methods=tuple(methods),
+        scores=tuple(scores),
+        notes=setting.notes,
+        seed=setting.config.seed,
+        command=shlex.join([Path(sys.argv[0]).name, *sys.argv[1:]]),
+        versions=_versions(),
+        seconds=time.monotonic() - began,
+    )
+    return result, variants
+
+
+def _variants(
+    setting: _Setting, methods: Sequence[MethodResult], tuned: dict[str, Any]
+) -> list[Variant]:
+    """Return what is scored: sharp, line, the filter before and after, each method."""
+    blur, free = setting.blur, setting.space.names
+    variants = [Variant(name="sharp")]
+    if blur.name != "line":
+        line = get_filter("line")().to(setting.cases[0].frame.device)
+        variants.append(Variant(name="line", blur=line))
+    variants.append(Variant(name="default", blur=blur, values=setting.space.start(), free=free))
+    if len(methods) > 1:
+        variants += [Variant(name=m.name, blur=blur, values=m.params, free=free) for m in methods]
+    return [*variants, Variant(name="tuned", blur=blur, values=tuned, free=free)]
+
+
+def _ceiling_scores(setting: _Setting, tuned: dict[str, Any]) -> list[CaseScore]:
+    steps = setting.config.ceiling_steps
+    if steps == 0:
+        return []
+    stage = Stage("ceiling", len(setting.cases), setting.progress)
+    scores: list[CaseScore] = []
+    for done, case in enumerate(setting.cases):
+        args = (setting.space, tuned, setting.config.objective, steps)
+        values = ceiling(case, setting.blur, *args)
+        variant = Variant(
+            name="ceiling", blur=setting.blur, values=values, free=setting.space.names
+        )
+        scores += [s for s in score_cases([case], [variant]) if s.variant == "ceiling"]
+        stage.step(done + 1, message=case.name)
+    return scores
+
+
+# -- results ---------------------------------------------------------------------------------------
+
+
+def _parameters(
+    space: Space, tuned: dict[str, Any], rises: dict[str, float]
+) -> tuple[ParameterResult, ...]:
+    rows = []
+    for parameter in space.parameters:
+        spec = parameter.spec
+        low, high = (None, None) if parameter.choices else spec.bounds
+        rows.append(
+            ParameterResult(
+                name=parameter.name,
+                symbol=spec.symbol,
+                unit=spec.unit,
+                meaning=spec.meaning,
+                source=spec.source,
+                default=parameter.default,
+                start=parameter.start,
+                tuned=tuned[parameter.name],
+                low=low,
+                high=high,
+                choices=parameter.choices,
+                scale=spec.scale,
+                sensitivity=rises.get(parameter.name),
+            )
+        )
+    return tuple(rows)
+
+
+def _common_shutter(setting: _Setting) -> dict[str, Any]:
+    """Return the shutter of the training frames for the preset, if they have one in common."""
+    shutters = {case.shutter for case in setting.cases if case.split == "train"}
+    if len(shutters) > 1:
+        return {}
+    shutter = shutters.pop()
+    given = {"shutter": shutter.open, "shutter_position": shutter.position}
+    return {key: value for key, value in given.items() if key not in setting.space.names}
+
+
+def _not_default(blur: BlurFilter, params: dict[str, Any]) -> dict[str, Any]:
+    default = blur.config_class()
+    return {key: value for key, value in params.items() if value != getattr(default, key)}
+
+
+def _write_preset(setting: _Setting, result: FitResult) -> None:
+    config = setting.config
+    figures: dict[str, Any] = {
+        split: {
+            variant: {m: v for m in _HEADLINE if (v := result.mean(variant, split, m)) is not None}
+            for variant in ("default", "tuned")
+        }
+        for split in ("train", "holdout")
+        if any(case.split == split for case in setting.cases)
+    }
+    evidence = {
+        "train": [case.name for case in setting.cases if case.split == "train"],
+        "holdout": [case.name for case in setting.cases if case.split == "holdout"],
+        "objective": config.objective.model_dump(mode="json"),
+        "objective_before": result.start_objective,
+        "objective_after": result.objective,
+        "method": result.chosen,
+        "figures": figures,
+        "seed": result.seed,
+        "command": result.command,
+        "versions": result.versions,
+    }
+    comment = (
+        f"{result.filter}, tuned by torchblur; report.html beside this file has the evidence.\n"
+        "Use it: torchblur filter INPUT.exr OUTPUT.exr --filter preset.yaml"
+    )
+    preset = Preset(filter=result.filter, params=result.params, evidence=evidence)
+    save_preset(setting.folder.path / "preset.yaml", preset, comment=comment, overwrite=True)
+
+
+def _method_name(config: TuneConfig, index: int) -> str:
+    """Return a short name, unique in the run: "gradient", "tpe", "tpe 2"."""
+    labels = [m.sampler if m.kind == "blackbox" else "gradient" for m in config.methods]
+    repeat = labels[: index + 1].count(labels[index])
+    return labels[index] if repeat == 1 else f"{labels[index]} {repeat}"
+
+
+def _versions() -> dict[str, str]:
+    names = ("torchblur", "torch", "optuna")
+    return {"python": platform.python_version()} | {
+        name: importlib.metadata.version(name) for name in names
+    }
+
+
+def _device(name: str) -> torch.device:
+    if name == "auto":
+        return torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    try:
+        device = torch.device(name)
+        torch.empty(0, device=device)
+    except (RuntimeError, AssertionError) as error:
+        reason = str(error).splitlines()[0]
+        raise ConfigError(f"`device` {name!r} cannot be used: {reason}") from error
+    return device
+
+
+def _data_reporter(progress: Progress | None) -> Any:
+    stage: list[Stage] = []
+
+    def report(done: int, total: int, name: str) -> None:
+        if not stage:
+            stage.append(Stage("data", total, progress))
+        stage[0].step(done, message=name)
+
+    return report

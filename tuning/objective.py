@@ -1,0 +1,99 @@
+"""The error that a fit makes small: weighted maps, averaged over the image and the band."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+from torchblur.metrics import (
+    FlipReference,
+    display_encode,
+    masked_mean,
+    prepare_flip_hdr,
+    prepare_flip_ldr,
+    ssim,
+)
+from tuning.config import ObjectiveSpec
+
+__all__ = ["PreparedObjective", "prepare_objective"]
+
+_RELATIVE_FLOOR = 0.01  # radiance² below which a relative error becomes absolute
+
+
+class PreparedObjective:
+    """An objective against one batch of references, filtered once and compared many times.
+
+    Args:
+        spec: Terms, color space, share of the band.
+        reference: Scene-linear radiance, (M, 3, H, W).
+        band: Band at moving borders, bool, (M, 1, H, W).
+    """
+
+    def __init__(self, spec: ObjectiveSpec, reference: Tensor, band: Tensor) -> None:
+        self.spec = spec
+        self._reference = reference
+        self._encoded = _encode(reference, spec.color_space)
+        self._flip: dict[str, FlipReference] = {}
+        if "flip" in spec.terms:
+            self._flip["flip"] = prepare_flip_ldr(reference)
+        if "flip_hdr" in spec.terms:
+            self._flip["flip_hdr"] = prepare_flip_hdr(reference)
+        self._weights = _weights(band, spec.band_weight)
+
+    def __call__(self, image: Tensor) -> Tensor:
+        """Return the objective of each image, (K,), at least 0.
+
+        Args:
+            image: Scene-linear radiance, (K, 3, H, W); K is that of the references, or any if
+                there is one reference.
+
+        Differentiable: yes.
+        """
+        total = image.new_zeros(image.shape[0])
+        for metric, weight in self.spec.terms.items():
+            total = total + weight * masked_mean(self._map(metric, image), self._weights)
+        return total
+
+    def _map(self, metric: str, image: Tensor) -> Tensor:
+        if metric in self._flip:
+            return self._flip[metric].error(image)
+        reference = self._reference.expand_as(image)
+        if metric == "ssim":
+            return 1 - ssim(image, reference)
+        return _DIFFERENCES[metric](_encode(image, self.spec.color_space), self._encoded)
+
+
+def prepare_objective(spec: ObjectiveSpec, reference: Tensor, band: Tensor) -> PreparedObjective:
+    """Return the objective against one batch of references; see `PreparedObjective`."""
+    return PreparedObjective(spec, reference, band)
+
+
+def _encode(image: Tensor, space: str) -> Tensor:
+    if space == "srgb":
+        return display_encode(image)
+    return torch.log1p(image.clamp_min(0)) if space == "log" else image
+
+
+def _weights(band: Tensor, share: float) -> Tensor | None:
+    """Return weights (M, 1, H, W) of mean 1: `share` of them spread over the band."""
+    if share == 0:
+        return None
+    inside = band.to(torch.float32)
+    mean = inside.mean(dim=(1, 2, 3), keepdim=True)
+    # Where nothing moves there is no band, and its share goes to the image.
+    return torch.where(mean > 0, (1 - share) + share * inside / mean.clamp_min(1e-12), 1.0)
+
+
+def _squared(image: Tensor, reference: Tensor) -> Tensor:
+    return ((image - reference) ** 2).mean(dim=1, keepdim=True)
+
+
+_DIFFERENCES: dict[str, Callable[[Tensor, Tensor], Tensor]] = {
+    "l1": lambda image, reference: (image - reference).abs().mean(dim=1, keepdim=True),
+    "mse": _squared,
+    "relative_l2": lambda image, reference: (
+        (image - reference) ** 2 / (reference**2 + _RELATIVE_FLOOR)
+    ).mean(dim=1, keepdim=True),
+}

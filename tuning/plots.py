@@ -1,0 +1,171 @@
+"""Curves of a fit as inline SVG, in colors that are readable on light and on dark pages."""
+
+from __future__ import annotations
+
+import io
+import math
+import re
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import matplotlib as mpl
+from markupsafe import Markup
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from tuning.result import FitResult, MethodResult, ParameterResult
+
+__all__ = ["loss_curves", "parameter_paths"]
+
+_GRAY = "#7d8590"
+_COLORS = ("#3b82f6", "#f59e0b", "#10b981", "#ec4899", "#8b5cf6", "#14b8a6", "#ef4444", "#a3a300")
+_STYLE: Any = {
+    "svg.fonttype": "none",
+    "svg.hashsalt": "torchblur",
+    "font.family": "sans-serif",
+    "font.size": 9,
+    "text.color": _GRAY,
+    "axes.labelcolor": _GRAY,
+    "axes.edgecolor": _GRAY,
+    "xtick.color": _GRAY,
+    "ytick.color": _GRAY,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.grid": True,
+    "grid.color": _GRAY,
+    "grid.alpha": 0.2,
+    "legend.frameon": False,
+}
+Records = Sequence[Mapping[str, Any]]
+
+
+def loss_curves(result: FitResult, records: Records) -> Markup:
+    """Return the objective over the steps of each method, all starts, as SVG.
+
+    Args:
+        result: The run's result.
+        records: Lines of the run's log.
+    """
+    count = len(result.methods)
+    with mpl.rc_context(_STYLE):
+        figure = Figure(figsize=(4.6 * count, 3.0), layout="constrained")
+        for index, method in enumerate(result.methods):
+            axes = figure.add_subplot(1, count, index + 1)
+            steps = _records_of(records, index)
+            if method.kind == "gradient":
+                _draw_starts(axes, steps)
+            else:
+                _draw_trials(axes, steps)
+            axes.axhline(result.start_objective, color=_GRAY, linestyle="--", linewidth=1)
+            axes.set(
+                title=method.name,
+                xlabel="step" if method.kind == "gradient" else "trial",
+                ylabel="objective on the training frames" if index == 0 else "",
+            )
+            axes.title.set_fontsize(10)
+            axes.legend(fontsize=8)
+        return _svg(figure, "loss")
+
+
+def parameter_paths(result: FitResult, records: Records, index: int) -> Markup:
+    """Return how the parameters moved (gradient) or what was tried (black box), as SVG.
+
+    Args:
+        result: The run's result.
+        records: Lines of the run's log.
+        index: Position of the method.
+    """
+    method = result.methods[index]
+    steps = _records_of(records, index)
+    named = [p for p in result.parameters if steps and p.name in steps[0]["params"]]
+    drawn = [p for p in named if p.low is not None]
+    columns = min(4, max(1, len(drawn)))
+    rows = math.ceil(max(1, len(drawn)) / columns)
+    with mpl.rc_context(_STYLE):
+        figure = Figure(figsize=(2.75 * columns, 1.85 * rows), layout="constrained")
+        for position, parameter in enumerate(drawn):
+            axes = figure.add_subplot(rows, columns, position + 1)
+            draw = _draw_path if method.kind == "gradient" else _draw_slice
+            draw(axes, steps, parameter, method)
+            axes.set_title(_label(parameter), fontsize=9)
+        return _svg(figure, f"paths{index}")
+
+
+def _draw_starts(axes: Axes, steps: Records) -> None:
+    xs = [record["step"] for record in steps]
+    for start in range(len(steps[0]["loss"]) if steps else 0):
+        ys = [_number(record["loss"][start]) for record in steps]
+        axes.plot(xs, ys, color=_color(start), linewidth=1.4, label=f"start {start + 1}")
+
+
+def _draw_trials(axes: Axes, steps: Records) -> None:
+    xs = [record["step"] for record in steps]
+    ys = [_number(record["loss"][0]) for record in steps]
+    axes.plot(xs, ys, ".", color=_color(0), markersize=3.5, alpha=0.6, label="trial")
+    best, lowest = [], math.inf
+    for y in ys:
+        lowest = lowest if math.isnan(y) else min(lowest, y)
+        best.append(lowest)
+    axes.plot(xs, best, color=_color(1), linewidth=1.4, label="best so far")
+    finite = sorted(y for y in ys if math.isfinite(y))
+    if finite:
+        top = finite[min(len(finite) - 1, int(0.9 * len(finite)))]
+        margin = 0.15 * (top - finite[0]) or 0.1 * abs(top) or 1.0
+        axes.set_ylim(finite[0] - margin, top + margin)
+
+
+def _draw_path(axes: Axes, steps: Records, parameter: ParameterResult, _: MethodResult) -> None:
+    xs = [record["step"] for record in steps]
+    for start in range(len(steps[0]["loss"])):
+        ys = [record["params"][parameter.name][start] for record in steps]
+        axes.plot(xs, ys, color=_color(start), linewidth=1.2)
+    if parameter.scale == "log":
+        axes.set_yscale("log")
+    axes.axhline(parameter.tuned, color=_GRAY, linestyle=":", linewidth=1)
+
+
+def _draw_slice(
+    axes: Axes, steps: Records, parameter: ParameterResult, method: MethodResult
+) -> None:
+    pairs = [(r["params"][parameter.name][0], _number(r["loss"][0])) for r in steps]
+    colors = [r["step"] for r in steps]
+    xs, ys = [x for x, _ in pairs], [y for _, y in pairs]
+    axes.scatter(xs, ys, c=colors, cmap="cool", s=5, alpha=0.8)
+    if parameter.scale == "log":
+        axes.set_xscale("log")
+    axes.axvline(method.params[parameter.name], color=_GRAY, linestyle=":", linewidth=1)
+    finite = sorted(y for y in ys if math.isfinite(y))
+    if finite and finite[-1] > finite[0]:
+        top = finite[int(0.9 * (len(finite) - 1))]
+        margin = 0.1 * (top - finite[0]) or 0.1 * abs(top) or 1.0
+        axes.set_ylim(finite[0] - margin, top + margin)
+
+
+def _label(parameter: ParameterResult) -> str:
+    unit = "" if parameter.unit == "1" else f" [{parameter.unit}]"
+    return f"{parameter.name}{unit}"
+
+
+def _records_of(records: Records, index: int) -> Records:
+    return [r for r in records if r.get("method") == index and "loss" in r]
+
+
+def _number(value: float | None) -> float:
+    return math.nan if value is None else value
+
+
+def _color(index: int) -> str:
+    return _COLORS[index % len(_COLORS)]
+
+
+def _svg(figure: Figure, salt: str) -> Markup:
+    """Return a figure as an `svg` element that scales with the page and has ids of its own."""
+    buffer = io.StringIO()
+    salted: Any = {"svg.hashsalt": salt}
+    with mpl.rc_context(salted):
+        figure.savefig(buffer, format="svg", transparent=True, metadata={"Date": None})
+    text = buffer.getvalue()
+    text = text[text.index("<svg") :]
+    text = re.sub(r"<metadata>.*?</metadata>", "", text, flags=re.DOTALL)
+    text = re.sub(r'(id="|url\(#|xlink:href="#)', rf"\g<1>{salt}-", text)
+    return Markup(text)

@@ -1,0 +1,286 @@
+"""The report of a fit: one HTML page with tables, sliders, error maps, curves and the evidence."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from markupsafe import Markup
+
+from torchblur.params import Param
+from tuning.config import TuneConfig
+from tuning.data import Case
+from tuning.evaluation import Variant, render
+from tuning.page import Column, Row, Table, View, make_view, render_page
+from tuning.plots import loss_curves, parameter_paths
+from tuning.result import FitResult, ParameterResult
+from tuning.runfolder import RunFolder
+
+__all__ = ["Verdict", "figures_table", "verdict_of", "write_report"]
+
+_MAX_VIEWS = 8
+_METRICS = {
+    "flip": Column(name="FLIP", digits=4, better="low"),
+    "psnr": Column(name="PSNR", digits=2, better="high"),
+    "ssim": Column(name="SSIM", digits=4, better="high"),
+    "flip_band": Column(name="FLIP, borders", digits=4, better="low"),
+    "psnr_band": Column(name="PSNR, borders", digits=2, better="high"),
+    "ssim_band": Column(name="SSIM, borders", digits=4, better="high"),
+}
+_NOTES = {
+    "sharp": "no filter",
+    "line": "line blur along each pixel's own motion",
+    "default": "before the fit",
+    "tuned": "after the fit",
+    "ceiling": "parameters fitted to each frame alone",
+    "noise": "a perfect image",
+}
+_UNRANKED = ("ceiling", "noise")
+_SPLITS = {"train": "Training", "holdout": "Hold-out"}
+_EXPLAINED = {
+    "line": "“line” is Rosado's line blur with its own defaults.",
+    "ceiling": "“ceiling” is the best that this filter does when its smooth parameters suit one "
+    "frame alone: no common set of them can be expected to be better.",
+    "noise": "“noise” is what a perfect image would score against references that have this much "
+    "noise of their own, an upper estimate: figures near it cannot be told from perfect.",
+}
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """The result in one sentence.
+
+    Args:
+        good: Whether the fit made things better where it counts.
+        text: The sentence.
+    """
+
+    good: bool
+    text: str
+
+
+def write_report(
+    folder: RunFolder,
+    config: TuneConfig,
+    result: FitResult,
+    cases: Sequence[Case],
+    variants: Sequence[Variant],
+) -> Path:
+    """Write `report.html` into a run folder.
+
+    Args:
+        folder: The run; its log, config.yaml and preset.yaml are read.
+        config: The resolved configuration.
+        result: The run's result.
+        cases: Frames of both splits.
+        variants: What was scored; sharp, line, default and tuned are shown.
+
+    Returns:
+        Where it lies.
+    """
+    shown = [v for v in variants if v.name in ("default", "tuned", "line", "sharp")]
+    # Hold-out first: these are the frames that say something.
+    ordered = sorted(cases, key=lambda case: case.split != "holdout")
+    views = [_view(i, case, shown) for i, case in enumerate(ordered[:_MAX_VIEWS])]
+    records = folder.records()
+    importances = next((m.importances for m in result.methods if m.importances), {})
+    page = render_page(
+        "fit.html",
+        result=result,
+        train_count=sum(case.split == "train" for case in cases),
+        verdict=verdict_of(result),
+        notes=result.notes,
+        tables=[t for split in ("holdout", "train") if (t := figures_table(result, split))],
+        explanations=[text for n, text in _EXPLAINED.items() if n in result.variants()],
+        views=views,
+        left_out=len(ordered) - len(views),
+        parameter_rows=_parameter_rows(result, importances),
+        importances=importances,
+        losses=loss_curves(result, records),
+        method_rows=_method_rows(result),
+        paths=_paths(result, records),
+        case_table=_case_table(result),
+        config_text=(folder.path / "config.yaml").read_text(encoding="utf-8"),
+        preset_text=(folder.path / "preset.yaml").read_text(encoding="utf-8"),
+    )
+    return folder.write("report.html", page)
+
+
+def verdict_of(result: FitResult) -> Verdict:
+    """Return what came out of a fit in one sentence, judged on the hold-out if there is one."""
+    split = "holdout" if result.mean("tuned", "holdout", "flip") is not None else "train"
+    where = "hold-out frames, which the fit never saw" if split == "holdout" else "training frames"
+    before, after = (result.mean(v, split, "flip") for v in ("default", "tuned"))
+    if result.chosen == "default":
+        return Verdict(False, "No method found anything better than the start values.")
+    assert before is not None
+    assert after is not None
+    change = _percent(after / before - 1) if before > 0 else ""
+    text = f"On the {where}, FLIP goes from {before:.4f} to {after:.4f} ({change})"
+    line = result.mean("line", split, "flip")
+    if line is not None:
+        text += f"; a plain line blur has {line:.4f}"
+        if after >= line:
+            text += ", which the tuned filter does not beat"
+    return Verdict(after < before, text + ".")
+
+
+def figures_table(result: FitResult, split: str) -> Table | None:
+    """Return the means of all variants over a split, or None if it has no frames.
+
+    Args:
+        result: A fit's result.
+        split: "train" or "holdout".
+    """
+    count = len({score.case for score in result.scores if score.split == split})
+    rows = [
+        Row(
+            name=variant,
+            values=[result.mean(variant, split, metric) for metric in _METRICS],
+            note=_NOTES.get(variant, ""),
+            ranked=variant not in _UNRANKED,
+            strong=variant == "tuned",
+        )
+        for variant in result.variants()
+        if result.mean(variant, split, "flip") is not None
+    ]
+    if not rows:
+        return None
+    frames = f"{count} frame{'' if count == 1 else 's'}"
+    return Table(title=f"{_SPLITS[split]}: {frames}", columns=list(_METRICS.values()), rows=rows)
+
+
+# -- sections --------------------------------------------------------------------------------------
+
+
+def _view(index: int, case: Case, variants: Sequence[Variant]) -> View:
+    order = ("default", "tuned", "line", "sharp")
+    chosen = sorted(variants, key=lambda variant: order.index(variant.name))
+    images = {variant.name: render(variant, case).cpu() for variant in chosen}
+    return make_view(
+        str(index),
+        case.name,
+        images,
+        case.reference.cpu(),
+        subtitle=f"{_SPLITS[case.split]} · shutter {case.shutter.open:g} frame, "
+        f"{case.shutter.position}",
+        mapped=[name for name in ("default", "tuned", "line") if name in images],
+    )
+
+
+def _parameter_rows(result: FitResult, importances: dict[str, float]) -> list[dict[str, Any]]:
+    rises = [p.sensitivity for p in result.parameters if p.sensitivity is not None]
+    largest = max([rise for rise in rises if math.isfinite(rise)], default=0.0)
+    return [_parameter_row(p, largest, importances) for p in result.parameters]
+
+
+def _parameter_row(
+    parameter: ParameterResult, largest: float, importances: dict[str, float]
+) -> dict[str, Any]:
+    row: dict[str, Any] = {
+        "name": parameter.name,
+        "symbol": parameter.symbol,
+        "unit": "" if parameter.unit == "1" else parameter.unit,
+        "default": _short(parameter.default),
+        "tuned": _short(parameter.tuned),
+        "low": _short(parameter.low),
+        "high": _short(parameter.high),
+        "choices": ", ".join(str(choice) for choice in parameter.choices),
+        "bar": _bar(parameter),
+        "at_end": parameter.tuned in (parameter.low, parameter.high) and not parameter.choices,
+        "meaning": parameter.meaning,
+        "source": parameter.source,
+        "importance": _percent(importances.get(parameter.name, 0.0), sign=""),
+        "rise": "",
+        "rise_width": 0.0,
+    }
+    if parameter.sensitivity is not None:
+        share = parameter.sensitivity / largest if largest > 0 else 0.0
+        row |= {
+            "rise": _percent(parameter.sensitivity, digits=2),
+            "rise_width": round(100 * min(max(share, 0.0), 1.0), 1),
+        }
+    return row
+
+
+def _bar(parameter: ParameterResult) -> tuple[float, float] | None:
+    """Return where default and tuned value lie in the range, in percent."""
+    if parameter.low is None or parameter.high is None:
+        return None
+    is_log = parameter.scale == "log"
+    spec = Param(
+        meaning="",
+        grad="smooth",
+        source="",
+        low=parameter.low,
+        high=parameter.high,
+        scale="log" if is_log else "linear",
+    )
+    default, tuned = (_place(spec, value) for value in (parameter.default, parameter.tuned))
+    return default, tuned
+
+
+def _place(spec: Param, value: float) -> float:
+    unit = float(spec.to_unit(torch.tensor(float(value), dtype=torch.float64)))
+    return round(100 * min(max(unit, 0.0), 1.0), 1)
+
+
+def _method_rows(result: FitResult) -> list[dict[str, Any]]:
+    return [
+        {
+            "name": method.name,
+            "chosen": method.name == result.chosen,
+            "objective": f"{method.objective:.5f}",
+            "change": _percent(method.objective / result.start_objective - 1)
+            if result.start_objective > 0
+            else "–",
+            "evaluations": method.evaluations,
+            "dropped": method.dropped,
+            "seconds": f"{method.seconds:.1f}",
+            "starts": [
+                "dropped" if start.objective is None else f"{start.objective:.5f}"
+                for start in method.starts
+            ],
+        }
+        for method in result.methods
+    ]
+
+
+def _paths(result: FitResult, records: Sequence[dict[str, Any]]) -> list[tuple[str, str, Markup]]:
+    return [
+        (method.name, method.kind, parameter_paths(result, records, index))
+        for index, method in enumerate(result.methods)
+    ]
+
+
+def _case_table(result: FitResult) -> Table:
+    by_case: dict[str, dict[str, dict[str, float | None]]] = {}
+    splits = {score.case: score.split for score in result.scores}
+    for score in result.scores:
+        by_case.setdefault(score.case, {})[score.variant] = score.scores
+    rows = []
+    for case, variants in by_case.items():
+        values: list[float | None] = []
+        for metric in ("flip", "psnr", "flip_band"):
+            before, after = variants["default"][metric], variants["tuned"][metric]
+            known = before is not None and after is not None
+            values += [before, after, after - before if known else None]  # type: ignore[operator]
+        rows.append(Row(name=case, values=values, note=_SPLITS[splits[case]].lower()))
+    columns = [
+        Column(name=f"{label}{what}", digits=digits, signed=what == " change")
+        for label, digits in (("FLIP", 4), ("PSNR", 2), ("FLIP, borders", 4))
+        for what in (" default", " tuned", " change")
+    ]
+    return Table(title="", columns=columns, rows=rows)
+
+
+def _short(value: Any) -> str:
+    return f"{value:.4g}" if isinstance(value, float) else str(value)
+
+
+def _percent(value: float, *, digits: int = 1, sign: str = "+") -> str:
+    return f"{100 * value:{sign}.{digits}f} %".replace("-", "−")

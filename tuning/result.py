@@ -1,0 +1,128 @@
+"""What a run finds out, as it stands in result.json."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any, Literal
+
+from pydantic import Field
+
+from torchblur.errors import ConfigError
+from torchblur.params import Config, build
+
+__all__ = ["CaseScore", "FitResult", "MethodResult", "ParameterResult", "StartResult"]
+
+Split = Literal["train", "holdout"]
+
+
+class StartResult(Config):
+    """Where one start of a gradient fit ended."""
+
+    first: dict[str, Any]
+    params: dict[str, Any]
+    objective: float | None
+    """On the training frames; null if the start was dropped for a loss that was not finite."""
+
+
+class MethodResult(Config):
+    """What one method found."""
+
+    name: str
+    kind: str
+    params: dict[str, Any]
+    objective: float
+    """On all training frames or windows; the choice between methods goes by it."""
+    evaluations: int
+    """Parameter sets evaluated."""
+    seconds: float
+    starts: tuple[StartResult, ...] = ()
+    dropped: int = 0
+    """Starts or trials with a loss that was not finite."""
+    importances: dict[str, float] = Field(default_factory=dict)
+    """Share of each parameter in the spread of the objective, as Optuna estimates it."""
+
+
+class ParameterResult(Config):
+    """One free parameter before and after the fit."""
+
+    name: str
+    symbol: str
+    unit: str
+    meaning: str
+    source: str
+    default: Any
+    start: Any
+    tuned: Any
+    low: float | None
+    high: float | None
+    choices: tuple[Any, ...] = ()
+    scale: str
+    sensitivity: float | None = None
+    """Rise of the training objective, relative, when it moves by 5 % of its range (the worse of
+    both directions); null for choices."""
+
+
+class CaseScore(Config):
+    """Figures of one image against one reference."""
+
+    case: str
+    split: Split
+    variant: str
+    """"default", "tuned", "gradient", "sharp", "line", "ceiling", "noise" …"""
+    scores: dict[str, float | None]
+    """flip, psnr, ssim and the same with _band; null where the band is empty."""
+
+
+class FitResult(Config):
+    """All that a run found; `result.json` in its folder holds the same."""
+
+    filter: str
+    params: dict[str, Any]
+    """All parameters that differ from the filter's defaults, the tuned ones included."""
+    chosen: str
+    """Name of the method whose parameters these are; "default" if none was better."""
+    start_objective: float
+    objective: float
+    parameters: tuple[ParameterResult, ...]
+    methods: tuple[MethodResult, ...]
+    scores: tuple[CaseScore, ...]
+    notes: tuple[str, ...] = ()
+    seed: int
+    command: str
+    versions: dict[str, str]
+    seconds: float
+
+    def mean(self, variant: str, split: str, metric: str) -> float | None:
+        """Return the mean of a metric over the cases of a split, or None if there is none.
+
+        Args:
+            variant: As in `CaseScore.variant`.
+            split: "train" or "holdout".
+            metric: "flip", "psnr", "ssim", "flip_band" …
+        """
+        values = [
+            value
+            for score in self.scores
+            if score.variant == variant
+            and score.split == split
+            and (value := score.scores.get(metric)) is not None
+        ]
+        return sum(values) / len(values) if values else None
+
+    def variants(self) -> tuple[str, ...]:
+        """Return the names of what was scored, in order."""
+        return tuple(dict.fromkeys(score.variant for score in self.scores))
+
+    @classmethod
+    def load(cls, path: Path) -> FitResult:
+        """Read a result.json.
+
+        Raises:
+            ConfigError: no such file, or not such a file.
+        """
+        try:
+            data = json.loads(path.read_text(encoding="utf-8"))
+        except (OSError, ValueError) as error:
+            raise ConfigError(f"{path} is no result of a fit: {error}") from error
+        return build(cls, data, str(path))
