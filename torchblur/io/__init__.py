@@ -2,9 +2,10 @@
 
 from torchblur.io.conventions import CONVENTIONS, Convention, ConventionOverrides, get_convention
 from torchblur.io.exr import ExrFile, ExrPart, Window, read_exr, write_exr
-from torchblur.io.frames import read_channels, read_frame, read_image, write_frame, write_image
+from torchblur.io.frames import read_channels, read_frame, read_image
 from torchblur.io.inspect import Inspection, inspect_file
 from torchblur.io.sequences import FrameFiles, find_frames
+from torchblur.io.writing import write_frame, write_image
 from torchblur.io.yaml import line_of, load_yaml, save_yaml
 
 __all__ = [

@@ -225,7 +225,8 @@ def _only_layer(file: ExrFile, planes: Sequence[Plane], layer: str) -> list[Plan
                 kept.append(Plane(short, short, plane.label, plane.part, plane.key, plane.view))
                 break
     if not kept:
-        layers = sorted({p.long_name.rpartition(".")[0] for p in planes} - {""})
+        words = [plane.long_name.split(".")[:-1] for plane in planes]
+        layers = sorted({".".join(w[:n]) for w in words for n in range(1, len(w) + 1)})
         hint = nearest_name(layer, layers)
         raise FileFormatError(
             f"{file.path} has no layer `{layer}`{hint}; layers: {', '.join(layers) or 'none'}"

@@ -210,9 +210,13 @@ def _read_part(path: Path, part: Any) -> ExrPart:
         view=str(header.get("view", "")),
         data_window=_window(header["dataWindow"]),
         display_window=_window(header["displayWindow"]),
-        compression=header["compression"].name.removesuffix("_COMPRESSION").lower(),
+        compression=_compression_name(header["compression"].name),
         attributes={key: _plain(value) for key, value in header.items() if key != "channels"},
     )
+
+
+def _compression_name(name: str) -> str:
+    return "none" if name == "NO_COMPRESSION" else name.removesuffix("_COMPRESSION").lower()
 
 
 def _window(box: tuple[NDArray[np.int32], NDArray[np.int32]]) -> Window:

@@ -386,4 +386,5 @@ def _about_color(color: Iterable[Plane], alpha: Iterable[Plane]) -> Iterable[str
 
 
 def _finite(array: NDArray[Any]) -> NDArray[Any]:
-    return array[np.isfinite(array)]
+    finite: NDArray[Any] = array[np.isfinite(array)]
+    return finite
