@@ -137,6 +137,8 @@ def test_depth_is_planar_and_normals_and_ids_are_right(make_scene, glow):
     ball = {"kind": "sphere", "radius": 1.0} | glow(0, 1, 0)
     wall = {"kind": "plane", "position": [0, 0, -2], "object_id": 9} | glow(1, 0, 0)
     frame = render_frame(make_scene(wall, ball), SIZE, color_spp=1)
+    other_order = render_frame(make_scene(ball, wall), SIZE, color_spp=1)
+    assert torch.equal(frame.depth, other_order.depth), "the nearest wins, not the last"
     is_wall = frame.object_id == 9
     assert bool((frame.depth[is_wall] - 6).abs().max() < 1e-6), "planar, not along the ray"
     assert frame.depth[0, 0, 11, 15] == pytest.approx(3)

@@ -28,6 +28,7 @@ CHUNK = 1 << 16
 """Rays that are traced at once; bounds the memory to some 20 MB."""
 
 _NEAR = 1e-4  # hits nearer than this, in lengths of the direction, are not seen
+_ROOM = 64  # tables of bodies are as long as a multiple of this
 _SKIN = 1e-4  # textures are taken this far below the surface: never on a border of cells
 
 
@@ -81,11 +82,16 @@ class Tracer:
         self._shapes = [self._table(_filled(body.shape, 4)) for body in self.bodies]
         self._numbers = torch.arange(len(placed), dtype=torch.int32, device=device).unbind(0)
         self._light = self._table([*_unit(scene.light.direction), scene.light.ambient])
-        self._emissive = self._table([body.emissive for body in self.bodies] + [True])
         textures = [*(body.texture for body in self.bodies), scene.sky]
-        self._paint = self._table([_filled(t.row(), TABLE_WIDTH) for t in textures]).T.contiguous()
         kinds = [TEXTURES.index(type(texture)) for texture in textures]
-        self._kinds = torch.tensor(kinds, device=device)
+        # Tables have room for more, so that most scenes are alike to the compiler.
+        width = -(-len(textures) // _ROOM) * _ROOM
+        emissive = [*(float(body.emissive) for body in self.bodies), 1.0]
+        self._emissive = self._table(_filled(emissive, width))
+        rows = [_filled(texture.row(), TABLE_WIDTH) for texture in textures]
+        rows += [[0.0] * TABLE_WIDTH] * (width - len(rows))
+        self._paint = self._table(rows).T.contiguous()
+        self._kinds = torch.tensor(_filled(kinds, width), device=device).int()
         self._kinds_used = sorted(set(kinds))
 
     def closest_hit(self, origins: Tensor, directions: Tensor, times: Tensor) -> Hit:
@@ -168,11 +174,12 @@ class Tracer:
         return state
 
     def _shade(self, state: _State) -> Vec:
-        _, body, color, normal = state
+        _, body, point, normal = state
+        color = _zeros(point)
         for kind in self._kinds_used:
             painter = _painter(kind)
             tables = (self._kinds, self._paint)
-            color = execute(painter, self._compiled, color, state[2], body, *tables)
+            color = execute(painter, self._compiled, color, point, body, *tables)
         lit: Vec = execute(_lit, self._compiled, color, normal, body, self._emissive, self._light)
         return lit
 
@@ -196,8 +203,12 @@ def _flat(state: _State) -> tuple[Tensor, ...]:
 def _nothing(direction: Vec, sky: int) -> _State:
     distance = torch.full_like(direction[0], math.inf)
     body = torch.full_like(direction[0], sky, dtype=torch.int32)
-    zero = torch.zeros_like(direction[0])
-    return distance, body, normalize(direction), (zero, zero, zero)
+    return distance, body, normalize(direction), _zeros(direction)
+
+
+def _zeros(like: Vec) -> Vec:
+    """Return three planes; one tensor thrice would be another case to the compiler."""
+    return torch.zeros_like(like[0]), torch.zeros_like(like[1]), torch.zeros_like(like[2])
 
 
 @functools.cache
