@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from torchblur.params import Config, build
+from torchblur.render import render_frame
 from torchblur.render.textures import TABLE_WIDTH, Texture, _hash
 
 
@@ -140,3 +141,14 @@ def test_cell_numbers_are_uniform_and_exact_in_float32():
     assert chi_square < 60  # 16 degrees of freedom
     neighbors = torch.corrcoef(torch.stack((double, _hash(*(cell + 1).double().unbind(0)))))
     assert abs(float(neighbors[0, 1])) < 0.02
+
+
+def test_face_on_the_border_of_cells_has_one_color(make_scene):
+    """A face that lies where two layers meet shows the one below it, not a mix by rounding."""
+    layers = {"kind": "stripes", "size": 1 / 3, "direction": [0, 0, 1], "color": FRONT}
+    body = {"kind": "box", "size": [1.0] * 3, "rotation": [0, 10, 3], "position": [0.1, 0.2, 0.3]}
+    texture = layers | {"background": BACK}
+    frame = render_frame(make_scene(body | {"texture": texture, "emissive": True}), (60, 80))
+    face = frame.color[0, :, 22:30, 38:46]
+    assert torch.equal(face, face[:, :1, :1].expand_as(face))
+    assert face[0, 0, 0] == 0.0, "the layer below the surface is the second one"

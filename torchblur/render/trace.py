@@ -25,7 +25,7 @@ from torchblur.render.vectors import Vec, add, dot, normalize, scale, select, su
 __all__ = ["CHUNK", "Hit", "Tracer"]
 
 CHUNK = 1 << 16
-"""Rays that are traced at once; bounds the memory to some 20 MB."""
+"""Rays that are traced at once; bounds the memory to some 150 MB."""
 
 _NEAR = 1e-4  # hits nearer than this, in lengths of the direction, are not seen
 _ROOM = 64  # tables of bodies are as long as a multiple of this
@@ -92,7 +92,6 @@ class Tracer:
         rows += [[0.0] * TABLE_WIDTH] * (width - len(rows))
         self._paint = self._table(rows).T.contiguous()
         self._kinds = torch.tensor(_filled(kinds, width), device=device).int()
-        self._kinds_used = sorted(set(kinds))
 
     def closest_hit(self, origins: Tensor, directions: Tensor, times: Tensor) -> Hit:
         """Return what each ray meets first at its own time.
@@ -176,7 +175,8 @@ class Tracer:
     def _shade(self, state: _State) -> Vec:
         _, body, point, normal = state
         color = _zeros(point)
-        for kind in self._kinds_used:
+        seen = torch.bincount(self._kinds[body], minlength=len(TEXTURES)).tolist()
+        for kind in (kind for kind, count in enumerate(seen) if count):
             painter = _painter(kind)
             tables = (self._kinds, self._paint)
             color = execute(painter, self._compiled, color, point, body, *tables)
