@@ -23,7 +23,7 @@ CASES = {
         {"noise": "none", "num_samples": 8, "tile_size": 7},
         {"noise": "gradient", "skip_middle_tap": False, "tile_size": 11},
         {"shutter": 0.9, "soft_depth_extent": 1.5, "color_lookup": "bilinear"},
-        {"shutter_position": "leading", "jitter": 1.7, "cone_slope": 0.6},
+        {"shutter_position": "leading", "jitter": 1.7, "cone_slope": 0.6, "cone_exponent": 0.3},
         {"shutter_position": "trailing", "cylinder_inner": 0.4, "cylinder_outer": 1.9},
         {"third_gain": 7.0, "foreground_gain": 0.5, "background_gain": 3.0, "center_gain": 5.0},
         {"min_length": 2.0, "early_out": 3.0, "tile_size": 5, "shutter": 0.4},
@@ -43,7 +43,7 @@ CASES = {
         {"luma": "true", "relative_depth_extent": 0.1},
         {"shutter_position": "leading", "tile_size": 16},
         {"shutter_position": "trailing", "third_gain": 9.0, "kappa": 5.0},
-        {"eta": 0.3, "phi": 60.0, "cone_slope": 2.0, "cylinder_inner": 0.2},
+        {"eta": 0.3, "phi": 60.0, "cone_slope": 2.0, "cone_exponent": 2.2},
         {"min_length": 1.5, "early_out": 2.0, "tile_size": 5, "shutter": 0.3},
     ],
 }

@@ -16,6 +16,7 @@ DEFAULTS = {
     "num_samples": 15,
     "tile_size": 20,
     "cone_slope": 1.0,
+    "cone_exponent": 1.0,
     "cylinder_inner": 0.95,
     "cylinder_outer": 1.05,
     "foreground_gain": 1.0,
@@ -197,7 +198,7 @@ def smoothstep(low, high, x):
 
 
 def cone(distance, spread, settings):
-    return sat(1 - settings.cone_slope * distance / spread)
+    return sat(1 - settings.cone_slope * distance / spread) ** settings.cone_exponent
 
 
 def cylinder(distance, spread, settings):

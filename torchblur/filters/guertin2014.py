@@ -9,9 +9,11 @@ from torch import Tensor
 
 from torchblur.filters.base import BlurFilter, Values
 from torchblur.filters.reconstruction import (
+    WEIGHT_PARAMETERS,
     ReconstructionConfig,
     Spread,
     Tap,
+    is_one,
     resolve,
     sample,
     spread_of,
@@ -155,6 +157,8 @@ class _Options(NamedTuple):
     two_directions: bool
     by_variance: bool
     direction_weights: bool
+    linear_direction: bool
+    linear_cone: bool
     own_length: bool
     relative_depth: bool
     softness: float
@@ -268,16 +272,7 @@ def _tap_inputs(frame: Frame, spread: Spread, dominant: Tensor, values: Values) 
         if values.depth_compare == "relative"
         else values.soft_depth_extent,
     }
-    for key in (
-        "cone_slope",
-        "cylinder_inner",
-        "cylinder_outer",
-        "foreground_gain",
-        "background_gain",
-        "third_gain",
-        "min_length",
-        "direction_exponent",
-    ):
+    for key in (*WEIGHT_PARAMETERS, "direction_exponent"):
         inputs[key] = getattr(values, key)
     return inputs
 
@@ -288,6 +283,8 @@ def _options(values: Values) -> _Options:
         two_directions=values.directions == "two",
         by_variance=values.sample_assignment == "variance",
         direction_weights=values.direction_weights,
+        linear_direction=is_one(values.direction_exponent),
+        linear_cone=is_one(values.cone_exponent),
         own_length=values.tap_length == "own",
         relative_depth=values.depth_compare == "relative",
         softness=values.softness,
@@ -362,8 +359,9 @@ def _weight(
         distance_p = (along - options.center * moved_p).abs()
         distance = torch.where(length_s <= length_p, distance_s, distance_p)
     slope, soft = inputs["cone_slope"], options.softness
-    first = inputs["foreground_gain"] * front * cone(distance_s, length_s, slope, soft)
-    second = inputs["background_gain"] * behind * cone(distance_p, length_p, slope, soft)
+    exponent = None if options.linear_cone else inputs["cone_exponent"]
+    first = inputs["foreground_gain"] * front * cone(distance_s, length_s, slope, exponent, soft)
+    second = inputs["background_gain"] * behind * cone(distance_p, length_p, slope, exponent, soft)
     third = inputs["third_gain"] * cylinder(
         distance,
         torch.minimum(length_s, length_p),
@@ -371,6 +369,10 @@ def _weight(
         inputs["cylinder_outer"],
     )
     if not options.direction_weights:
-        return first + second + third
-    theirs = power(toward.abs(), inputs["direction_exponent"])
-    return first * theirs + second * own + third * torch.maximum(own, theirs)
+        total: Tensor = first + second + third
+        return total
+    theirs = toward.abs()
+    if not options.linear_direction:
+        theirs = power(theirs, inputs["direction_exponent"])
+    directed: Tensor = first * theirs + second * own + third * torch.maximum(own, theirs)
+    return directed

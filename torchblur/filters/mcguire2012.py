@@ -9,7 +9,9 @@ from torch import Tensor
 
 from torchblur.filters.base import BlurFilter, Values
 from torchblur.filters.reconstruction import (
+    WEIGHT_PARAMETERS,
     ReconstructionConfig,
+    is_one,
     resolve,
     sample,
     spread_of,
@@ -59,6 +61,7 @@ class McGuire2012Config(ReconstructionConfig):
 class _Options(NamedTuple):
     center: int
     skip_middle_tap: bool
+    linear_cone: bool
     softness: float
     color_lookup: Lookup
 
@@ -125,19 +128,12 @@ def _layers(frame: Frame, values: Values, engine: Engine) -> dict[str, Tensor]:
         "unit": spread.unit,
         "extent": values.soft_depth_extent,
     }
-    for key in (
-        "cone_slope",
-        "cylinder_inner",
-        "cylinder_outer",
-        "foreground_gain",
-        "background_gain",
-        "third_gain",
-        "min_length",
-    ):
+    for key in WEIGHT_PARAMETERS:
         inputs[key] = getattr(values, key)
     options = _Options(
         Shutter(1, values.shutter_position).center,
         values.skip_middle_tap and values.shutter_position == "centered",
+        is_one(values.cone_exponent),
         values.softness,
         values.color_lookup,
     )
@@ -169,10 +165,15 @@ def _tap(index: Tensor, count: Tensor, inputs: Inputs, options: _Options) -> tup
         moved_p = inputs["length"] * (ux * dx + uy * dy)
         distance_s = (along - options.center * moved_s).abs()
         distance_p = (along - options.center * moved_p).abs()
+    exponent = None if options.linear_cone else inputs["cone_exponent"]
     slope, ends = inputs["cone_slope"], (inputs["cylinder_inner"], inputs["cylinder_outer"])
     weight = (
-        inputs["foreground_gain"] * front * cone(distance_s, length_s, slope, options.softness)
-        + inputs["background_gain"] * behind * cone(distance_p, length_p, slope, options.softness)
+        inputs["foreground_gain"]
+        * front
+        * cone(distance_s, length_s, slope, exponent, options.softness)
+        + inputs["background_gain"]
+        * behind
+        * cone(distance_p, length_p, slope, exponent, options.softness)
         + inputs["third_gain"]
         * cylinder(distance_s, length_s, *ends)
         * cylinder(distance_p, length_p, *ends)

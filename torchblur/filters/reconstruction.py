@@ -16,10 +16,12 @@ from torchblur.ops.velocity import clamp_length, direction, half_velocity, lengt
 from torchblur.params import Param
 
 __all__ = [
+    "WEIGHT_PARAMETERS",
     "ReconstructionConfig",
     "Spread",
     "Tap",
     "Tiles",
+    "is_one",
     "resolve",
     "sample",
     "spread_of",
@@ -67,6 +69,17 @@ class ReconstructionConfig(FilterConfig):
             grad="smooth",
             source=_WEIGHTS,
             meaning="slope of the cone weight over distance / length; 1 reaches 0 at the end",
+        ),
+    ] = 1.0
+    cone_exponent: Annotated[
+        float,
+        Param(
+            low=0.1,
+            high=4.0,
+            scale="log",
+            grad="smooth",
+            source="1 in McGuire 2012, section 3.3",
+            meaning="exponent of the cone weight; below 1 it comes nearer to a box",
         ),
     ] = 1.0
     cylinder_inner: Annotated[
@@ -236,6 +249,24 @@ def texture_of(frame: Frame, spread: Spread) -> Tensor:
         valid = frame.valid.to(frame.dtype)
         planes = [frame.color * valid, *planes[1:], valid]
     return torch.cat(planes, 1)
+
+
+WEIGHT_PARAMETERS = (
+    "cone_slope",
+    "cone_exponent",
+    "cylinder_inner",
+    "cylinder_outer",
+    "foreground_gain",
+    "background_gain",
+    "third_gain",
+    "min_length",
+)
+"""Parameters that the taps of both filters take as they are."""
+
+
+def is_one(value: Tensor) -> bool:
+    """Whether an exponent is 1 and needs no gradient, so that its power can be left out."""
+    return not (value.requires_grad and torch.is_grad_enabled()) and bool((value == 1).all())
 
 
 class Tap(NamedTuple):

@@ -31,19 +31,26 @@ def saturate(value: Tensor, softness: float = 0.0) -> Tensor:
 
 
 def cone(
-    distance: Tensor, length: Tensor, slope: float | Tensor = 1.0, softness: float = 0.0
+    distance: Tensor,
+    length: Tensor,
+    slope: float | Tensor = 1.0,
+    exponent: float | Tensor | None = None,
+    softness: float = 0.0,
 ) -> Tensor:
-    """Return ``sat(1 − slope · distance / length)``.
+    """Return ``sat(1 − slope · distance / length) ** exponent``.
 
     Args:
         distance: Distance between pixel and sample along the blur, px, >= 0.
         length: Half spread of whichever of the two blurs, px, > 0.
         slope: 1 reaches zero at the end of the spread.
+        exponent: > 0; towards 0 the cone becomes the box that a constant speed would leave.
+            None leaves it out (an exponent of 1, without its cost).
         softness: See `saturate`.
 
-    Reference: McGuire 2012, section 3.3. We differ: the slope is a parameter.
+    Reference: McGuire 2012, section 3.3. We differ: slope and exponent are parameters.
     """
-    return saturate(1 - slope * distance / length, softness)
+    weight = saturate(1 - slope * distance / length, softness)
+    return weight if exponent is None else power(weight, exponent)
 
 
 def cylinder(

@@ -1,0 +1,50 @@
+# make demo, make test, make lint, make bench: each sets up .venv by itself.
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+
+.PHONY: help demo test lint bench images clean
+
+help:
+	@echo "make demo   tune Guertin's filter on procedural scenes; report in runs/demo/report.html"
+	@echo "make test   run the tests"
+	@echo "make lint   format, lint, types, import contracts"
+	@echo "make bench  time filters and memory (leave the machine alone meanwhile)"
+	@echo "make images the pictures of the README"
+
+# torch comes first and by its exact version; its range in pyproject.toml is for other set-ups.
+$(VENV)/.base: constraints.txt
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/pip install --quiet --disable-pip-version-check -r constraints.txt
+	touch $@
+
+$(VENV)/.tune: $(VENV)/.base pyproject.toml
+	$(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[tune]'
+	touch $@
+
+$(VENV)/.dev: $(VENV)/.base pyproject.toml
+	$(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev]'
+	touch $@ $(VENV)/.tune
+
+demo: $(VENV)/.tune
+	$(BIN)/torchblur tune configs/tune/demo.yaml -o runs/demo --overwrite
+	@echo "Open runs/demo/report.html"
+
+# One torch thread per worker: two that share a core wait for each other.
+test: $(VENV)/.dev
+	OMP_NUM_THREADS=1 $(BIN)/pytest -n auto
+
+lint: $(VENV)/.dev
+	$(BIN)/ruff format --check .
+	$(BIN)/ruff check .
+	$(BIN)/mypy
+	$(BIN)/lint-imports
+
+bench: $(VENV)/.tune
+	$(BIN)/python -m tuning.bench
+
+images: $(VENV)/.tune
+	$(BIN)/python docs/make_images.py
+
+clean:
+	rm -rf $(VENV) runs out

@@ -1,0 +1,176 @@
+"""Benchmarks of the filters: time (eager against compiled) and the memory of a backward pass.
+
+::
+
+    python -m tuning.bench [--size 1280x720] [--samples 35] [--runs 3] [--json FILE]
+
+Figures are medians, each measurement in a process of its own. CPU-seconds are what to compare:
+on a machine that is not idle, wall time and multi-threaded CPU time are both inflated, and the
+program says so.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import resource
+import statistics
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+__all__ = ["main"]
+
+_KNOWN = {
+    "prototype, eager, one lookup per layer": 16.0,
+    "prototype, eager, packed lookup": 2.1,
+    "prototype, compiled tap": 1.1,
+    "hand-written fused C++ loop": 0.6,
+}
+"""CPU-seconds per frame of other Guertin programs at 1280x720, N = 35, on two quiet cores."""
+
+
+def main() -> None:
+    """Run the benchmarks and print their tables."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument("--size", default="1280x720", help="WIDTHxHEIGHT in px")
+    parser.add_argument("--samples", type=int, default=35, help="taps N")
+    parser.add_argument("--runs", type=int, default=3, help="timed runs of each")
+    parser.add_argument("--json", type=Path, help="write the figures here too")
+    parser.add_argument("--child", help=argparse.SUPPRESS)
+    arguments = parser.parse_args()
+    if arguments.child:
+        print(json.dumps(_measure(json.loads(arguments.child))))
+        return
+    width, height = (int(n) for n in arguments.size.split("x"))
+    job = {"width": width, "height": height, "runs": arguments.runs}
+    _warn_if_busy()
+    figures = {
+        "speed": _speed(job | {"num_samples": arguments.samples}),
+        "memory": _memory(job, arguments.samples),
+    }
+    if arguments.json:
+        arguments.json.write_text(json.dumps(figures, indent=2))
+
+
+def _warn_if_busy() -> None:
+    load = os.getloadavg()[0]
+    if load > 0.5:
+        print(f"warning: the machine is busy (load {load:.1f}); figures are inflated\n")
+
+
+def _speed(job: dict[str, Any]) -> list[dict[str, Any]]:
+    """Time each filter eagerly and compiled, forward and with its backward pass."""
+    print(
+        f"forward and backward, {job['width']}x{job['height']}, N = {job['num_samples']}, "
+        f"all pixels move, {os.cpu_count()} cores; medians of {job['runs']}"
+    )
+    print(
+        f"{'filter':<14}{'engine':<10}{'forward CPU s':>14}{'wall s':>8}"
+        f"{'fwd+bwd CPU s':>15}{'wall s':>8}{'first call s':>14}{'eager / it':>12}"
+    )
+    rows: list[dict[str, Any]] = []
+    for name in ("line", "mcguire2012", "guertin2014"):
+        for engine in ("eager", "compiled"):
+            row = _child(job | {"filter": name, "engine": engine, "what": "speed"})
+            rows.append(row | {"filter": name, "engine": engine})
+            eager = rows[-1 if engine == "eager" else -2]
+            print(
+                f"{name:<14}{engine:<10}{row['cpu']:>14.2f}{row['wall']:>8.2f}"
+                f"{row['backward_cpu']:>15.2f}{row['backward_wall']:>8.2f}"
+                f"{row['first']:>14.1f}{eager['cpu'] / row['cpu']:>12.2f}"
+            )
+    print("\nfor comparison, Guertin at 1280x720, N = 35, two quiet cores, CPU s per frame:")
+    for text, seconds in _KNOWN.items():
+        print(f"  {text:<42}{seconds:>6.1f}")
+    return rows
+
+
+def _memory(job: dict[str, Any], num_samples: int) -> list[dict[str, Any]]:
+    """Compare the peak memory of a backward pass with many taps and with five."""
+    print(f"\npeak memory of forward and backward, guertin2014, {job['width']}x{job['height']}")
+    rows: list[dict[str, Any]] = []
+    for taps in (5, num_samples):
+        row = _child(
+            job
+            | {"filter": "guertin2014", "engine": "eager", "what": "memory", "num_samples": taps}
+        )
+        rows.append(row | {"num_samples": taps})
+        print(
+            f"  N = {taps:<4} {row['peak_mib']:>8.0f} MiB above the {row['base_mib']:.0f} MiB "
+            "of the loaded program and frame"
+        )
+    ratio = rows[1]["peak_mib"] / rows[0]["peak_mib"]
+    print(f"  ratio {ratio:.2f}")
+    return rows
+
+
+def _child(job: dict[str, Any]) -> dict[str, Any]:
+    command = [sys.executable, "-m", "tuning.bench", "--child", json.dumps(job)]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    result: dict[str, Any] = json.loads(done.stdout.splitlines()[-1])
+    return result
+
+
+def _measure(job: dict[str, Any]) -> dict[str, Any]:
+    import torch
+
+    from torchblur.filters import get_filter
+    from torchblur.frame import Frame
+
+    generator = torch.Generator().manual_seed(0)
+    size = (job["height"], job["width"])
+    coarse = torch.randn(1, 2, 9, 16, generator=generator) * 20
+    frame = Frame(
+        color=torch.rand(1, 3, *size, generator=generator).requires_grad_(),
+        velocity=torch.nn.functional.interpolate(coarse, size, mode="bilinear"),
+        depth=torch.rand(1, 1, *size, generator=generator) + 1,
+    )
+    blur = get_filter(job["filter"])(engine=job["engine"], num_samples=job["num_samples"])
+
+    def forward() -> None:
+        with torch.no_grad():
+            blur(frame)
+
+    def backward() -> None:
+        frame.color.grad = None
+        blur(frame).square().mean().backward()
+
+    if job["what"] == "memory":
+        base = _peak_mib()
+        backward()
+        return {"base_mib": base, "peak_mib": _peak_mib() - base}
+    start = time.perf_counter()
+    forward()
+    first = time.perf_counter() - start
+    cpu, wall = _median(forward, job["runs"])
+    backward()
+    backward_cpu, backward_wall = _median(backward, job["runs"])
+    return {
+        "first": first,
+        "cpu": cpu,
+        "wall": wall,
+        "backward_cpu": backward_cpu,
+        "backward_wall": backward_wall,
+    }
+
+
+def _median(function: Any, runs: int) -> tuple[float, float]:
+    cpu, wall = [], []
+    for _ in range(runs):
+        start = time.process_time(), time.perf_counter()
+        function()
+        cpu.append(time.process_time() - start[0])
+        wall.append(time.perf_counter() - start[1])
+    return statistics.median(cpu), statistics.median(wall)
+
+
+def _peak_mib() -> float:
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+
+
+if __name__ == "__main__":
+    main()
