@@ -1,9 +1,12 @@
 """Small frames, and cases whose reference is the filter's own output at known parameters."""
 
+from pathlib import Path
+
 import torch
 
 from torchblur.filters import get_filter
 from torchblur.frame import Frame, Shutter
+from torchblur.io import write_frame, write_image
 from torchblur.metrics import border_band
 from tuning.data import Case
 
@@ -49,3 +52,28 @@ def planted_case(seed: int, split: str = "train", filter_name: str = "guertin201
         identity=str(seed),
         origin=str(seed),
     )
+
+
+def write_planted(root: Path) -> dict:
+    """Write two planted cases as EXR; return the data of a configuration that fits them."""
+    for seed, name in ((1, "first"), (2, "second")):
+        folder = root / name
+        folder.mkdir(parents=True)
+        case = planted_case(seed)
+        write_frame(folder / "sharp.exr", case.frame, half=False)
+        write_image(folder / "reference.exr", case.reference, half=False)
+    return {
+        "filter": {"kind": "guertin2014", "params": dict(FIXED), "free": list(PLANTED)},
+        "data": {
+            "root": str(root),
+            "train": [{"kind": "exr", "path": "first", "shutter": 1.0}],
+            "holdout": [{"kind": "exr", "path": "second", "shutter": 1.0}],
+        },
+        "objective": {"terms": {"mse": 1.0}, "color_space": "linear"},
+        "methods": [
+            {"kind": "gradient", "steps": 4, "starts": 2},
+            {"kind": "blackbox", "sampler": "tpe", "trials": 5},
+        ],
+        "seed": 5,
+        "device": "cpu",
+    }

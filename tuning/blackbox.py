@@ -1,8 +1,8 @@
 """An Optuna study over the free parameters, of every class, kept in a journal in the run folder.
 
-The sampler of each trial is seeded by the run's seed and the trial's number, so that a study that
-was killed draws what it would have drawn; the trial that was in flight is taken up again with the
-values that it had.
+The study is worked on in memory; each finished trial is added to the journal with one line. The
+sampler of a trial is seeded by the run's seed and the trial's number. So a study that was killed
+loses the trial in flight alone, draws it again with the same values, and ends as it would have.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from typing import Any
 import optuna
 import torch
 from optuna.samplers import BaseSampler, CmaEsSampler, GPSampler, RandomSampler, TPESampler
-from optuna.storages import BaseStorage, InMemoryStorage, JournalStorage
+from optuna.storages import InMemoryStorage, JournalStorage
 from optuna.storages.journal import JournalFileBackend
 from optuna.trial import FrozenTrial, Trial, TrialState
 
@@ -27,11 +27,9 @@ from tuning.problem import Problem
 from tuning.progress import Progress, Stage
 from tuning.result import MethodResult
 from tuning.runfolder import RunFolder, trim_torn_line
-from tuning.space import Space
+from tuning.space import FreeParameter, Space
 
 __all__ = ["BlackBoxJob", "fit_blackbox"]
-
-_FINISHED = (TrialState.COMPLETE, TrialState.FAIL)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -78,58 +76,49 @@ def fit_blackbox(
         FitError: no trial has a finite loss.
     """
     optuna.logging.set_verbosity(optuna.logging.WARNING)
-    study = _open_study(job, folder)
-    done = len(study.get_trials(deepcopy=False, states=_FINISHED))
-    stage = Stage(job.name, job.method.trials, progress, done=done)
+    study = optuna.create_study(storage=InMemoryStorage())
+    journal = None if folder is None else _journal(folder, job.index)
+    for trial in journal.get_trials() if journal is not None else ():
+        study.add_trial(trial)
+    done = len(study.trials)
     if folder is not None:
         folder.drop_records(job.index, 0)
-        for trial in study.get_trials(deepcopy=False, states=_FINISHED):
+        for trial in study.trials:
             _log(folder, job, trial)
+    stage = Stage(job.name, job.method.trials, progress, done=done)
     for number in range(done, job.method.trials):
-        loss = _run_trial(study, problem, job, number)
-        if folder is not None:
-            _log(folder, job, study.get_trials(deepcopy=False)[number])
-        stage.step(number + 1, loss=loss if math.isfinite(loss) else None, best=_best(study))
+        trial = _run_trial(study, problem, job, number)
+        if folder is not None and journal is not None:
+            journal.add_trial(trial)
+            _log(folder, job, trial)
+        stage.step(number + 1, loss=trial.value, best=_best(study))
     return _result(study, problem, job)
 
 
-def _open_study(job: BlackBoxJob, folder: RunFolder | None) -> optuna.Study:
-    study = optuna.create_study(
-        storage=InMemoryStorage() if folder is None else _journal(folder, job.index),
-        study_name="fit",
-        direction="minimize",
-        load_if_exists=True,
-    )
-    points = job.first[: job.method.trials]
-    for point in points[len(study.get_trials(deepcopy=False)) :]:
-        study.enqueue_trial({name: point[name] for name in job.space.names})
-    return study
-
-
-def _journal(folder: RunFolder, index: int) -> BaseStorage:
+def _journal(folder: RunFolder, index: int) -> optuna.Study:
     path = folder.path / f"study-{index}.log"
     # This process holds the run's own lock: what a killed one left here is stale.
     trim_torn_line(path)
     path.with_name(f"{path.name}.lock").unlink(missing_ok=True)
-    return JournalStorage(JournalFileBackend(str(path)))
+    storage = JournalStorage(JournalFileBackend(str(path)))
+    return optuna.create_study(storage=storage, study_name="fit", load_if_exists=True)
 
 
-def _run_trial(study: optuna.Study, problem: Problem, job: BlackBoxJob, number: int) -> float:
+def _run_trial(study: optuna.Study, problem: Problem, job: BlackBoxJob, number: int) -> FrozenTrial:
     study.sampler = _sampler(job, number)
-    in_flight = study.get_trials(deepcopy=False, states=(TrialState.RUNNING,))
+    if number < len(job.first):
+        study.enqueue_trial({name: job.first[number][name] for name in job.space.names})
     with _one_thread(job.method.sampler == "gp"):
-        trial = Trial(study, in_flight[0]._trial_id) if in_flight else study.ask()
-        values = {p.name: _suggest(trial, job.space, p.name) for p in job.space.parameters}
+        trial = study.ask()
+        values = {p.name: _suggest(trial, p) for p in job.space.parameters}
     loss = float(problem.mean(dict(job.fixed) | values))
     if math.isfinite(loss):
-        study.tell(trial, loss)
-    else:
-        study.tell(trial, state=TrialState.FAIL)
-    return loss
+        return study.tell(trial, loss)
+    return study.tell(trial, state=TrialState.FAIL)
 
 
-def _suggest(trial: Trial, space: Space, name: str) -> Any:
-    parameter = next(p for p in space.parameters if p.name == name)
+def _suggest(trial: Trial, parameter: FreeParameter) -> Any:
+    name = parameter.name
     if parameter.choices:
         return trial.suggest_categorical(name, parameter.choices)
     low, high = parameter.spec.bounds
@@ -167,7 +156,7 @@ def _log(folder: RunFolder, job: BlackBoxJob, trial: FrozenTrial) -> None:
 
 
 def _result(study: optuna.Study, problem: Problem, job: BlackBoxJob) -> MethodResult:
-    finished = study.get_trials(deepcopy=False, states=_FINISHED)
+    finished = study.get_trials(deepcopy=False)
     complete = [t for t in finished if t.state == TrialState.COMPLETE]
     if not complete:
         raise FitError(f"{job.name}: none of {len(finished)} trials has a finite loss")

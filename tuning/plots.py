@@ -11,7 +11,9 @@ from typing import Any
 import matplotlib as mpl
 from markupsafe import Markup
 from matplotlib.axes import Axes
+from matplotlib.axis import Axis
 from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 
 from tuning.result import FitResult, MethodResult, ParameterResult
 
@@ -121,6 +123,7 @@ def _draw_path(axes: Axes, steps: Records, parameter: ParameterResult, _: Method
         axes.plot(xs, ys, color=_color(start), linewidth=1.2)
     if parameter.scale == "log":
         axes.set_yscale("log")
+        _plain_numbers(axes.yaxis)
     axes.axhline(parameter.tuned, color=_GRAY, linestyle=":", linewidth=1)
 
 
@@ -133,12 +136,20 @@ def _draw_slice(
     axes.scatter(xs, ys, c=colors, cmap="cool", s=5, alpha=0.8)
     if parameter.scale == "log":
         axes.set_xscale("log")
+        _plain_numbers(axes.xaxis)
     axes.axvline(method.params[parameter.name], color=_GRAY, linestyle=":", linewidth=1)
     finite = sorted(y for y in ys if math.isfinite(y))
     if finite and finite[-1] > finite[0]:
         top = finite[int(0.9 * (len(finite) - 1))]
         margin = 0.1 * (top - finite[0]) or 0.1 * abs(top) or 1.0
         axes.set_ylim(finite[0] - margin, top + margin)
+
+
+def _plain_numbers(axis: Axis) -> None:
+    """Label a logarithmic axis with a few plain numbers."""
+    axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0), numticks=6))
+    axis.set_minor_locator(NullLocator())
+    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
 
 
 def _label(parameter: ParameterResult) -> str:

@@ -121,9 +121,12 @@ def verdict_of(result: FitResult) -> Verdict:
     assert after is not None
     change = _percent(after / before - 1) if before > 0 else ""
     text = f"On the {where}, FLIP goes from {before:.4f} to {after:.4f} ({change})"
+    psnr = [result.mean(variant, split, "psnr") for variant in ("default", "tuned")]
+    if None not in psnr:
+        text += f", PSNR from {psnr[0]:.2f} to {psnr[1]:.2f} dB"
     line = result.mean("line", split, "flip")
     if line is not None:
-        text += f"; a plain line blur has {line:.4f}"
+        text += f"; a plain line blur has FLIP {line:.4f}"
         if after >= line:
             text += ", which the tuned filter does not beat"
     return Verdict(after < before, text + ".")
@@ -272,10 +275,10 @@ def _case_table(result: FitResult) -> Table:
         rows.append(Row(name=case, values=values, note=_SPLITS[splits[case]].lower()))
     columns = [
         Column(name=f"{label}{what}", digits=digits, signed=what == " change")
-        for label, digits in (("FLIP", 4), ("PSNR", 2), ("FLIP, borders", 4))
-        for what in (" default", " tuned", " change")
+        for label, digits in (("FLIP", 4), ("PSNR", 2), ("borders", 4))
+        for what in (" before", " after", " change")
     ]
-    return Table(title="", columns=columns, rows=rows)
+    return Table(title="“borders”: FLIP in the band", columns=columns, rows=rows)
 
 
 def _short(value: Any) -> str:

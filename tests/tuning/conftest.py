@@ -3,10 +3,9 @@
 import os
 
 import pytest
-from planted import FIXED, PLANTED, planted_case
+from planted import FIXED, PLANTED, planted_case, write_planted
 
 from torchblur.filters import get_filter
-from torchblur.io import write_frame, write_image
 from tuning.config import ObjectiveSpec
 from tuning.data import make_samples
 from tuning.problem import Problem
@@ -30,25 +29,5 @@ def planted_problem():
 
 @pytest.fixture
 def planted_folders(tmp_path):
-    """Write two planted cases as EXR; return the data of a configuration that fits them."""
-    for seed, name in ((1, "first"), (2, "second")):
-        folder = tmp_path / "frames" / name
-        folder.mkdir(parents=True)
-        case = planted_case(seed)
-        write_frame(folder / "sharp.exr", case.frame, half=False)
-        write_image(folder / "reference.exr", case.reference, half=False)
-    return {
-        "filter": {"kind": "guertin2014", "params": dict(FIXED), "free": list(PLANTED)},
-        "data": {
-            "root": str(tmp_path / "frames"),
-            "train": [{"kind": "exr", "path": "first", "shutter": 1.0}],
-            "holdout": [{"kind": "exr", "path": "second", "shutter": 1.0}],
-        },
-        "objective": {"terms": {"mse": 1.0}, "color_space": "linear"},
-        "methods": [
-            {"kind": "gradient", "steps": 6, "starts": 2},
-            {"kind": "blackbox", "sampler": "tpe", "trials": 8},
-        ],
-        "seed": 5,
-        "device": "cpu",
-    }
+    """The data of a configuration that fits two planted cases on disk."""
+    return write_planted(tmp_path / "frames")
