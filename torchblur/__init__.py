@@ -9,7 +9,7 @@
     color = blur(frame)                       # (B, 3, H, W), scene-linear, differentiable
 """
 
-from torchblur.errors import ConfigError, FileFormatError, FrameError, TorchblurError
+from torchblur.errors import ConfigError, FileFormatError, FrameError, OutputError, TorchblurError
 from torchblur.filters import BlurFilter, get_filter, registered_filters
 from torchblur.frame import Frame, Shutter
 from torchblur.io import read_frame, read_image, write_frame, write_image
@@ -23,6 +23,7 @@ __all__ = [
     "FileFormatError",
     "Frame",
     "FrameError",
+    "OutputError",
     "Preset",
     "Shutter",
     "TorchblurError",

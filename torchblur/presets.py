@@ -65,11 +65,9 @@ def save_preset(
         overwrite: Replace an existing file.
 
     Raises:
-        ConfigError: the file exists and `overwrite` is off, or it cannot be written.
+        OutputError: the file exists and `overwrite` is off, or it cannot be written.
     """
-    if Path(path).exists() and not overwrite:
-        raise ConfigError(f"{path} exists; use another name or overwrite it")
-    save_yaml(path, preset.model_dump(), comment=comment)
+    save_yaml(path, preset.model_dump(), comment=comment, overwrite=overwrite)
 
 
 def create_filter(
