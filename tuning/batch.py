@@ -9,7 +9,7 @@ from __future__ import annotations
 import os
 import re
 import threading
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, CancelledError, Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -201,32 +201,48 @@ def run_batch(plan: Plan, progress: Progress | None = None) -> BatchResult:
     remove_leftovers(outputs)
     result = BatchResult(skipped=len(plan.states) - len(jobs))
     stage = Stage("batch", len(jobs), progress)
+    stage.step(0)
+    log = _Log(result, stage)
+    stopped = _Runner(plan, log).run(jobs)
+    result.interrupted = stopped and len(result.written) + len(result.failures) < len(jobs)
+    return result
 
-    def record(job: Job, future: Future[None]) -> None:
+
+class _Log:
+    """Writes down what becomes of each job, and tells the progress."""
+
+    def __init__(self, result: BatchResult, stage: Stage) -> None:
+        self._result, self._stage = result, stage
+
+    def record(self, job: Job, future: Future[None]) -> None:
         reason = _reason(future)
         if reason is None:
-            result.written.append(job.output)
+            self._result.written.append(job.output)
         else:
-            result.failures.append(Failure(job, reason))
-        failed = f"{len(result.failures)} failed" if result.failures else job.output.name
-        stage.step(len(result.written) + len(result.failures), message=failed)
+            self._result.failures.append(Failure(job, reason))
+        failed = len(self._result.failures)
+        self._tell(f"{failed} failed" if failed else job.output.name)
 
-    result.interrupted = _Runner(plan).run(jobs, record)
-    return result
+    def stopping(self, count: int) -> None:
+        self._tell(f"stopping: {count} frames in flight are finished; Ctrl-C again drops them")
+
+    def _tell(self, message: str) -> None:
+        done = len(self._result.written) + len(self._result.failures)
+        self._stage.step(done, message=message)
 
 
 class _Runner:
     """Two pools of threads: one reads ahead, one filters and writes."""
 
-    def __init__(self, plan: Plan) -> None:
-        self._plan = plan
+    def __init__(self, plan: Plan, log: _Log) -> None:
+        self._plan, self._log = plan, log
         self._config = plan.config
         self._blur: BlurFilter = make_filter(plan.config)
         self._dropped = threading.Event()
         # torch.compile is not made for several threads: they take turns, with all cores each.
         self._turn = threading.Lock() if plan.config.engine == "compiled" else None
 
-    def run(self, jobs: Iterable[Job], record: Callable[[Job, Future[None]], None]) -> bool:
+    def run(self, jobs: Iterable[Job]) -> bool:
         """Run the jobs; return whether the user stopped them."""
         threads = torch.get_num_threads()
         share = 1 if self._turn else self._config.workers
@@ -237,12 +253,12 @@ class _Runner:
         readers = ThreadPoolExecutor(max(1, self._config.workers), "read")
         running: dict[Future[None], Job] = {}
         try:
-            self._feed(iter(jobs), workers, readers, running, record)
+            self._feed(jobs, workers, readers, running)
             return False
         except KeyboardInterrupt:
             readers.shutdown(wait=False, cancel_futures=True)
             workers.shutdown(wait=False, cancel_futures=True)
-            self._finish(running, record)
+            self._finish(running)
             return True
         finally:
             readers.shutdown(cancel_futures=True)
@@ -255,28 +271,33 @@ class _Runner:
         workers: ThreadPoolExecutor,
         readers: ThreadPoolExecutor,
         running: dict[Future[None], Job],
-        record: Callable[[Job, Future[None]], None],
     ) -> None:
         limit = self._config.workers + self._config.prefetch
         for job in jobs:
             frame = readers.submit(read_job, job, self._config)
             running[workers.submit(self._make, job, frame)] = job
             while len(running) >= limit:
-                _collect(running, record)
+                self._collect(running)
         while running:
-            _collect(running, record)
+            self._collect(running)
 
-    def _finish(
-        self, running: dict[Future[None], Job], record: Callable[[Job, Future[None]], None]
-    ) -> None:
+    def _finish(self, running: dict[Future[None], Job]) -> None:
         """Wait for the frames in flight; those whose turn did not come are dropped."""
         for future in [f for f in running if f.cancelled()]:
             del running[future]
+        self._log.stopping(len(running))
         while running:
             try:
-                _collect(running, record)
+                self._collect(running)
             except KeyboardInterrupt:
                 self._dropped.set()
+
+    def _collect(self, running: dict[Future[None], Job]) -> None:
+        finished, _ = wait(running, return_when=FIRST_COMPLETED)
+        for future in finished:
+            job = running.pop(future)
+            if not _was_dropped(future):
+                self._log.record(job, future)
 
     def _make(self, job: Job, reading: Future[Frame]) -> None:
         frame = reading.result()
@@ -290,14 +311,6 @@ class _Runner:
         write_job(
             job, color, layers, settings=self._config, recipe=self._plan.recipe, overwrite=True
         )
-
-
-def _collect(running: dict[Future[None], Job], record: Callable[[Job, Future[None]], None]) -> None:
-    finished, _ = wait(running, return_when=FIRST_COMPLETED)
-    for future in finished:
-        job = running.pop(future)
-        if not _was_dropped(future):
-            record(job, future)
 
 
 def _was_dropped(future: Future[None]) -> bool:

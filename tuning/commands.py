@@ -86,7 +86,7 @@ app = typer.Typer(
     cls=_Commands,
     no_args_is_help=True,
     pretty_exceptions_enable=False,
-    rich_markup_mode="rich",
+    rich_markup_mode="markdown",
     context_settings={"help_option_names": ["-h", "--help"]},
     help="Differentiable motion-blur filters: tune them to reference renders, and apply them.",
     epilog="Exit codes: 0 done, 1 something failed, 2 bad input, 130 stopped with Ctrl-C.",
@@ -134,7 +134,10 @@ def _options(
 
 @app.command()
 def tune(
-    config: Annotated[Path, typer.Argument(help="What to fit to what; configs/tune has examples.")],
+    config: Annotated[
+        Path,
+        typer.Argument(metavar="CONFIG", help="What to fit to what; configs/tune has examples."),
+    ],
     output: Annotated[
         Path | None,
         typer.Option("-o", "--output", metavar="DIR", help="Run folder. Default: runs/CONFIG."),
@@ -179,7 +182,7 @@ def filter_(  # noqa: PLR0913 - each argument is an option
     ],
     inputs: Annotated[
         list[str],
-        typer.Argument(metavar="INPUT...", help="EXR files, a folder, or a pattern with ####."),
+        typer.Argument(metavar="INPUT", help="EXR files, a folder, or a pattern with ####."),
     ],
     output: Annotated[
         str | None,
@@ -225,7 +228,9 @@ def filter_(  # noqa: PLR0913 - each argument is an option
 
 @app.command()
 def batch(
-    config: Annotated[Path, typer.Argument(help="What to filter; configs/batch has examples.")],
+    config: Annotated[
+        Path, typer.Argument(metavar="CONFIG", help="What to filter; configs/batch has examples.")
+    ],
     set_: Set = None,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Print the plan alone.")] = False,
     overwrite: Annotated[
@@ -255,7 +260,9 @@ def batch(
 
 @app.command()
 def render(  # noqa: PLR0913 - each argument is an option
-    scene: Annotated[str, typer.Argument(help="Scene file, or a name in configs/scenes.")],
+    scene: Annotated[
+        str, typer.Argument(metavar="SCENE", help="Scene file, or a name in configs/scenes.")
+    ],
     output: Annotated[
         Path, typer.Option("-o", "--output", metavar="DIR", help="Folder for the files.")
     ],
@@ -284,7 +291,7 @@ def render(  # noqa: PLR0913 - each argument is an option
 
 @app.command()
 def compare(
-    images: Annotated[list[Path], typer.Argument(metavar="IMAGE...", help="EXR or PNG files.")],
+    images: Annotated[list[Path], typer.Argument(metavar="IMAGE", help="EXR or PNG files.")],
     reference: Annotated[Path, typer.Option(metavar="REF", help="Image with true motion blur.")],
     output: Annotated[
         Path | None,
@@ -335,7 +342,7 @@ def params(
 
 @app.command()
 def inspect(
-    file: Annotated[Path, typer.Argument(help="EXR file.")],
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="EXR file.")],
     reference: Annotated[
         Path | None,
         typer.Option(

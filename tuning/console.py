@@ -46,6 +46,7 @@ status = Console(stderr=True, highlight=False)
 """Standard error."""
 
 _LOG_EVERY = 5.0
+_NOTE_COLUMN = Column(no_wrap=True, overflow="ellipsis", ratio=1)  # takes what the bars leave
 _METRICS = {
     "flip": ("FLIP", ".4f", "less"),
     "psnr": ("PSNR", ".2f", "more"),
@@ -92,9 +93,9 @@ def show_progress() -> Iterator[Progress]:
         MofNCompleteColumn(),
         TimeElapsedColumn(),
         TextColumn("[cyan]{task.fields[left]}"),
-        TextColumn("[dim]{task.fields[note]}", table_column=Column(no_wrap=True)),
+        TextColumn("[dim]{task.fields[note]}", table_column=_NOTE_COLUMN),
     )
-    with Bars(*columns, console=status) as bars:
+    with Bars(*columns, console=status, expand=True) as bars:
         yield _Bars(bars)
 
 

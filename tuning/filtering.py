@@ -148,6 +148,7 @@ def filter_files(
     """
     blur = make_filter(settings)
     stage = Stage(blur.name, len(jobs), progress if len(jobs) > 1 else None)
+    stage.step(0)
     scores = []
     for done, job in enumerate(jobs, start=1):
         frame = read_job(Job(job.source, job.source, job.gbuffer), settings)

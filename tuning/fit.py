@@ -290,7 +290,7 @@ def _write_preset(setting: _Setting, result: FitResult) -> None:
     }
     comment = (
         f"{result.filter}, tuned by torchblur; report.html beside this file has the evidence.\n"
-        "Use it: torchblur filter INPUT.exr OUTPUT.exr --filter preset.yaml"
+        "Use it: torchblur filter preset.yaml INPUT.exr -o OUTPUT.exr"
     )
     preset = Preset(filter=result.filter, params=result.params, evidence=evidence)
     save_preset(setting.folder.path / "preset.yaml", preset, comment=comment, overwrite=True)

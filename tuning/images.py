@@ -14,7 +14,8 @@ from PIL import Image, PngImagePlugin, UnidentifiedImageError
 from torch import Tensor
 
 from torchblur.errors import FileFormatError, OutputError
-from torchblur.io import read_exr, read_image, write_image
+from torchblur.io import read_image, write_image
+from torchblur.io import read_metadata as read_exr_metadata
 from torchblur.io.paths import input_file, output_file
 from torchblur.metrics import display_encode
 from torchblur.ops.color import srgb_to_linear
@@ -100,7 +101,7 @@ def read_metadata(path: str | Path) -> dict[str, Any]:
     """
     path = Path(path)
     if path.suffix.lower() != ".png":
-        return read_exr(path).metadata
+        return read_exr_metadata(path)
     try:
         with Image.open(path) as image:
             image.load()

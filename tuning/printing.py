@@ -48,8 +48,9 @@ def print_parameters(filter_name: str | None = None) -> None:
         registered_filters() if filter_name is None else {filter_name: get_filter(filter_name)}
     )
     for name, kind in filters.items():
-        summary = (kind.__doc__ or "").strip().splitlines()[0]
-        results.print(Text.assemble((name, "bold"), f"  {kind.__name__}: {summary}"))
+        summary = " ".join((kind.__doc__ or "").split()).split(". ")[0].rstrip(".")
+        head = Text.assemble((name, "bold"), f"  {kind.__name__}: {summary}")
+        results.print(head, soft_wrap=True)
         results.print(_parameters(kind))
 
 
@@ -91,7 +92,7 @@ def _entry(kind: type[BlurFilter], name: str, spec: Param, default: str) -> Any:
         f" = {default}",
         (f"   {_range(kind, name, spec)}{unit}{scale}, {spec.grad}", "green"),
     )
-    text = Text.assemble(spec.meaning, (f"  {spec.source}", "dim"))
+    text = Text.assemble(spec.meaning, (f" ({spec.source})", "dim"))
     return Group(Padding(head, (0, 0, 0, 2)), Padding(text, (0, 0, 0, 6)))
 
 

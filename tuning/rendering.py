@@ -119,6 +119,7 @@ def render_sequence(
     make_folders([folder])
     remove_leftovers([task.path for task in todo])
     stage = Stage("render", len(todo), progress)
+    stage.step(0)
     for done, task in enumerate(todo, start=1):
         _render(task, scene, settings, made_by(task.recipe, path))
         stage.step(done, message=task.path.name)

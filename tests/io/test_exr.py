@@ -5,7 +5,7 @@ import OpenEXR
 import pytest
 
 from torchblur.errors import FileFormatError, OutputError
-from torchblur.io.exr import ExrPart, Window, read_exr, to_half, write_exr
+from torchblur.io.exr import ExrPart, Window, read_exr, read_metadata, to_half, write_exr
 
 
 def channels(height=33, width=47, seed=0):
@@ -257,3 +257,18 @@ def test_a_failing_write_leaves_nothing_behind(tmp_path, monkeypatch):
         write_exr(path, channels(), overwrite=True)
     assert [p.name for p in tmp_path.iterdir()] == ["a.exr"]
     assert path.read_bytes() == b"precious"
+
+
+def test_metadata_without_the_pixels(tmp_path):
+    write_exr(tmp_path / "a.exr", channels(), metadata={"κ": 40.0, "list": [1, None]})
+    assert read_metadata(tmp_path / "a.exr") == {"κ": 40.0, "list": [1, None]}
+    write_exr(tmp_path / "b.exr", channels())
+    assert read_metadata(tmp_path / "b.exr") == {}
+
+
+def test_metadata_of_a_file_cut_short_are_refused(tmp_path):
+    write_exr(tmp_path / "a.exr", channels(), metadata={"a": 1})
+    content = (tmp_path / "a.exr").read_bytes()
+    (tmp_path / "a.exr").write_bytes(content[:-100])
+    with pytest.raises(FileFormatError, match=r"a\.exr is truncated"):
+        read_metadata(tmp_path / "a.exr")

@@ -437,6 +437,7 @@ main()
         _, stderr = process.communicate(timeout=30)
         assert process.returncode == 130
         assert "Traceback" not in stderr
+        assert "frames in flight are finished; Ctrl-C again drops them" in stderr
         assert "the same command goes on" in stderr
         assert not list(out.glob(".*"))
         self.check_and_finish(tmp_path, out)

@@ -1,7 +1,7 @@
 """Files: OpenEXR frames of torchblur and of other programs, sequences, and YAML."""
 
 from torchblur.io.conventions import CONVENTIONS, Convention, ConventionOverrides, get_convention
-from torchblur.io.exr import ExrFile, ExrPart, Window, read_exr, write_exr
+from torchblur.io.exr import ExrFile, ExrPart, Window, read_exr, read_metadata, write_exr
 from torchblur.io.frames import read_channels, read_frame, read_image
 from torchblur.io.inspect import Inspection, inspect_file
 from torchblur.io.sequences import FrameFiles, find_frames
@@ -26,6 +26,7 @@ __all__ = [
     "read_exr",
     "read_frame",
     "read_image",
+    "read_metadata",
     "save_yaml",
     "write_exr",
     "write_frame",

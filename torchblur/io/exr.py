@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import os
 import struct
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -21,7 +21,16 @@ from numpy.typing import NDArray
 from torchblur.errors import FileFormatError, OutputError
 from torchblur.io.paths import input_file, output_file
 
-__all__ = ["HALF_MAX", "ExrFile", "ExrPart", "Window", "read_exr", "to_half", "write_exr"]
+__all__ = [
+    "HALF_MAX",
+    "ExrFile",
+    "ExrPart",
+    "Window",
+    "read_exr",
+    "read_metadata",
+    "to_half",
+    "write_exr",
+]
 
 HALF_MAX = 65504.0
 """Largest finite value of half float."""
@@ -92,11 +101,7 @@ class ExrFile:
     @property
     def metadata(self) -> dict[str, Any]:
         """What `write_exr` was given as metadata; empty for files of other programs."""
-        for part in self.parts:
-            text = part.attributes.get(METADATA_KEY)
-            if isinstance(text, str):
-                return _from_json(self.path, text)
-        return {}
+        return _metadata(self.path, (part.attributes for part in self.parts))
 
 
 def read_exr(path: str | Path) -> ExrFile:
@@ -113,10 +118,7 @@ def read_exr(path: str | Path) -> ExrFile:
         FileFormatError: if the file is missing, empty, a folder, no OpenEXR file, truncated,
             damaged, deep, or has subsampled channels.
     """
-    path = input_file(path)
-    if not OpenEXR.isOpenExrFile(str(path)):
-        raise FileFormatError(f"{path} is not an OpenEXR file; it begins with {_head(path)}")
-    _check_complete(path)
+    path = _whole_file(path)
     try:
         header = OpenEXR.File(str(path), header_only=True)
         file = OpenEXR.File(str(path), separate_channels=True)
@@ -129,6 +131,27 @@ def read_exr(path: str | Path) -> ExrFile:
             f"{len(header.parts)} parts cannot be decoded"
         )
     return ExrFile(path=path, parts=tuple(_read_part(path, part) for part in file.parts))
+
+
+def read_metadata(path: str | Path) -> dict[str, Any]:
+    """Read what `write_exr` was given as metadata, without decoding the pixels.
+
+    Args:
+        path: The file.
+
+    Returns:
+        The metadata; empty for files of other programs.
+
+    Raises:
+        FileFormatError: if the file is missing, empty, a folder, no OpenEXR file or truncated, or
+            its header is damaged.
+    """
+    path = _whole_file(path)
+    try:
+        header = OpenEXR.File(str(path), header_only=True)
+    except Exception as error:
+        raise FileFormatError(f"{path} is damaged: {error}") from error
+    return _metadata(path, (part.header for part in header.parts))
 
 
 def write_exr(
@@ -191,6 +214,22 @@ def to_half(array: NDArray[Any], name: str) -> NDArray[np.float16]:
 
 
 # -- reading -----------------------------------------------------------------------------------
+
+
+def _whole_file(path: str | Path) -> Path:
+    path = input_file(path)
+    if not OpenEXR.isOpenExrFile(str(path)):
+        raise FileFormatError(f"{path} is not an OpenEXR file; it begins with {_head(path)}")
+    _check_complete(path)
+    return path
+
+
+def _metadata(path: Path, headers: Iterable[Mapping[str, Any]]) -> dict[str, Any]:
+    for attributes in headers:
+        text = attributes.get(METADATA_KEY)
+        if isinstance(text, str):
+            return _from_json(path, text)
+    return {}
 
 
 def _read_part(path: Path, part: Any) -> ExrPart:
