@@ -25,7 +25,13 @@ CASES = {
         {"shutter": 0.9, "soft_depth_extent": 1.5, "color_lookup": "bilinear"},
         {"shutter_position": "leading", "jitter": 1.7, "cone_slope": 0.6, "cone_exponent": 0.3},
         {"shutter_position": "trailing", "cylinder_inner": 0.4, "cylinder_outer": 1.9},
-        {"third_gain": 7.0, "foreground_gain": 0.5, "background_gain": 3.0, "center_gain": 5.0},
+        {
+            "depth_level": 0.4,
+            "third_gain": 7.0,
+            "foreground_gain": 0.5,
+            "background_gain": 3.0,
+            "center_gain": 5.0,
+        },
         {"min_length": 2.0, "early_out": 3.0, "tile_size": 5, "shutter": 0.4},
     ],
     "guertin2014": [
@@ -40,7 +46,7 @@ CASES = {
         {"stochastic_tiles": False, "center_weight": False, "tile_size": 9},
         {"depth_compare": "absolute", "soft_depth_extent": 0.7, "color_lookup": "bilinear"},
         {"velocity_encoding": "uint8", "tile_size": 12},
-        {"luma": "true", "relative_depth_extent": 0.1},
+        {"luma": "true", "depth_level": 0.5, "relative_depth_extent": 0.1},
         {"shutter_position": "leading", "tile_size": 16},
         {"shutter_position": "trailing", "third_gain": 9.0, "kappa": 5.0},
         {"eta": 0.3, "phi": 60.0, "cone_slope": 2.0, "cone_exponent": 2.2},

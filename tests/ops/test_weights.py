@@ -33,6 +33,12 @@ def test_level_depths_are_both():
         assert (float(level.foreground), float(level.background)) == (1.0, 1.0)
 
 
+def test_level_of_one_half_makes_the_weights_add_up_to_one():
+    for sample in (6.9, 6.96, 7.0, 7.03, 7.2):
+        weights = depth_weights(t(7.0), t(sample), 0.1, relative=False, level=0.5)
+        assert float(weights.foreground + weights.background) == pytest.approx(1.0, abs=1e-5)
+
+
 def test_relative_comparison_does_not_depend_on_the_scale_of_the_scene():
     near = depth_weights(t(1.0), t(1.3), 0.5, relative=True)
     far = depth_weights(t(100.0), t(130.0), 0.5, relative=True)

@@ -230,9 +230,9 @@ def tap_weight(position, d, depths, velocities, factors, settings):
 def depth_factors(z_p, z_s, settings):
     """f = zCompare(Z[p], Z[S]), b = zCompare(Z[S], Z[p]), for positive depths."""
     if settings.depth_compare == "absolute":
-        return common.depth_absolute(z_p, z_s, settings.soft_depth_extent)
+        return common.depth_absolute(z_p, z_s, settings.soft_depth_extent, settings.depth_level)
     extent = settings.relative_depth_extent * min(z_p, z_s)
-    return common.depth_absolute(z_p, z_s, extent)
+    return common.depth_absolute(z_p, z_s, extent, settings.depth_level)
 
 
 # -- output for anti-aliasing ------------------------------------------------------------------

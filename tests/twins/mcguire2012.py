@@ -72,7 +72,7 @@ def tap_weight(position, direction, depths, velocities, settings):
     spread_s = common.floored_length(v_s, settings)
     distance_p = common.distance_along(position, v_p, direction, settings)
     distance_s = common.distance_along(position, v_s, direction, settings)
-    f, b = common.depth_absolute(*depths, settings.soft_depth_extent)
+    f, b = common.depth_absolute(*depths, settings.soft_depth_extent, settings.depth_level)
 
     # Case 1: a blurry S in front of X.
     weight = settings.foreground_gain * f * common.cone(distance_s, spread_s, settings)

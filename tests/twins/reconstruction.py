@@ -17,6 +17,7 @@ DEFAULTS = {
     "tile_size": 20,
     "cone_slope": 1.0,
     "cone_exponent": 1.0,
+    "depth_level": 1.0,
     "cylinder_inner": 0.95,
     "cylinder_outer": 1.05,
     "foreground_gain": 1.0,
@@ -206,9 +207,9 @@ def cylinder(distance, spread, settings):
     return 1 - smoothstep(low, high, distance)
 
 
-def depth_absolute(z_p, z_s, extent):
+def depth_absolute(z_p, z_s, extent, level=1):
     """softDepthCompare in positive depth: (f: S is in front of p, b: S is behind p)."""
-    return sat(1 + (z_p - z_s) / extent), sat(1 + (z_s - z_p) / extent)
+    return sat(level + (z_p - z_s) / extent), sat(level + (z_s - z_p) / extent)
 
 
 def distance_along(position, v, direction, settings):

@@ -347,6 +347,7 @@ def _weight(
         tap.depth,
         inputs["extent"],
         relative=options.relative_depth,
+        level=inputs["depth_level"],
         softness=options.softness,
     )
     dx, dy = d.split(1, 1)

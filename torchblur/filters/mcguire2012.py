@@ -154,7 +154,12 @@ def _tap(index: Tensor, count: Tensor, inputs: Inputs, options: _Options) -> tup
     dx, dy = inputs["direction"].split(1, 1)
     tap = sample(inputs, inputs["x"] - along * dx, inputs["y"] - along * dy, options.color_lookup)
     front, behind = depth_weights(
-        inputs["depth"], tap.depth, inputs["extent"], relative=False, softness=options.softness
+        inputs["depth"],
+        tap.depth,
+        inputs["extent"],
+        relative=False,
+        level=inputs["depth_level"],
+        softness=options.softness,
     )
     length_s = torch.maximum(tap.length, inputs["min_length"])
     length_p = torch.maximum(inputs["length"], inputs["min_length"])

@@ -132,6 +132,16 @@ class ReconstructionConfig(FilterConfig):
             meaning="gain of the third weight: both blur over each other",
         ),
     ] = 2.0
+    depth_level: Annotated[
+        float,
+        Param(
+            low=0.25,
+            high=1.0,
+            grad="smooth",
+            source="1 in McGuire 2012, section 3.3; 1/2 in Jimenez 2014",
+            meaning="both depth weights where sample and pixel are at one depth",
+        ),
+    ] = 1.0
     min_length: Annotated[
         float,
         Param(
@@ -259,6 +269,7 @@ WEIGHT_PARAMETERS = (
     "foreground_gain",
     "background_gain",
     "third_gain",
+    "depth_level",
     "min_length",
 )
 """Parameters that the taps of both filters take as they are."""

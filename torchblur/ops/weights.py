@@ -78,18 +78,26 @@ class DepthWeights(NamedTuple):
 
 
 def depth_weights(
-    pixel: Tensor, sample: Tensor, extent: float | Tensor, *, relative: bool, softness: float = 0.0
+    pixel: Tensor,
+    sample: Tensor,
+    extent: float | Tensor,
+    *,
+    relative: bool,
+    level: float | Tensor = 1.0,
+    softness: float = 0.0,
 ) -> DepthWeights:
     """Return the soft classification of a sample as foreground and background.
 
-    ``foreground = sat(1 + (Z_p − Z_S) / extent)``, background with the sign swapped; level depths
-    give 1 for both. With `relative`, the extent is multiplied by the nearer depth.
+    ``foreground = sat(level + (Z_p − Z_S) / extent)``, background with the sign swapped. With
+    `relative`, the extent is multiplied by the nearer depth.
 
     Args:
         pixel: Z_p, positive depth of the pixel, scene units, finite.
         sample: Z_S, positive depth of the sample, scene units, finite.
         extent: Difference over which a weight falls from 1 to 0: scene units, or (relative) as
             a fraction of the nearer depth.
+        level: What both weights are where the depths are level: 1 in McGuire 2012, 1/2 in
+            Jimenez 2014 (the two then add up to 1).
         relative: Relative comparison (Guertin 2014) or absolute (McGuire 2012).
         softness: See `saturate`.
 
@@ -97,11 +105,13 @@ def depth_weights(
     Reference: McGuire 2012, section 3.3 (softDepthCompare); Guertin 2014, section 5 (zCompare).
         We differ from the latter: for positive depths the test as printed would take nearer
         samples for background; ours has the sign that its text means, and the extent that it
-        fixes at 1 is a parameter.
+        fixes at 1 is a parameter, and so is the level.
     """
     scale = extent * torch.minimum(pixel, sample) if relative else extent
     difference = (pixel - sample) / scale
-    return DepthWeights(saturate(1 + difference, softness), saturate(1 - difference, softness))
+    return DepthWeights(
+        saturate(level + difference, softness), saturate(level - difference, softness)
+    )
 
 
 def power(base: Tensor, exponent: float | Tensor) -> Tensor:
