@@ -207,8 +207,10 @@ def filter_(  # noqa: PLR0913 - each argument is an option
 ) -> None:
     """Blur frames that a renderer wrote.
 
-    Keys for --set are the filter's parameters (`torchblur params FILTER` lists them); shutter is
-    one of them.
+    Keys for --set are the filter's parameters (`torchblur params FILTER` lists them), shutter
+    among them, and: layers=[NAME, ...] to write more than color, overrides.FIELD for what differs
+    from the convention (velocity_scale, velocity_y, depth ...), on_invalid=mask, half, engine,
+    device.
     """
     from tuning.filtering import filter_files, load_settings, plan_files
 
@@ -282,10 +284,14 @@ def render(  # noqa: PLR0913 - each argument is an option
     from tuning.rendering import find_scene, render_sequence, settings_of
 
     settings = settings_of(size, spp=spp, frames=frames, shutter=shutter, seed=seed)
-    with show_progress() as progress:
-        files = render_sequence(
-            find_scene(scene), output, settings, overwrite=overwrite, progress=progress
-        )
+    try:
+        with show_progress() as progress:
+            files = render_sequence(
+                find_scene(scene), output, settings, overwrite=overwrite, progress=progress
+            )
+    except KeyboardInterrupt as error:
+        print_error("stopped (Ctrl-C); the same command goes on")
+        raise typer.Exit(_INTERRUPTED) from error
     results.print(f"{len(files)} files in {output}: {files[0].name} to {files[-1].name}")
 
 

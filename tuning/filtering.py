@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,6 +15,7 @@ from torchblur.errors import ConfigError, FrameError, OutputError
 from torchblur.filters import BlurFilter
 from torchblur.frame import Frame
 from torchblur.metrics import border_band, evaluate
+from torchblur.params import build
 from torchblur.presets import create_filter
 from tuning.apply import FilterSettings, blur_frame, make_filter, read_job, recipe_of, write_job
 from tuning.config import apply_overrides
@@ -35,6 +37,8 @@ __all__ = [
 
 BASELINES = ("line", "mcguire2012", "guertin2014")
 """Filters that a result is compared with, at their papers' settings."""
+
+_SETTINGS = FilterSettings.model_fields.keys() - {"filter", "params"}
 
 
 @dataclass(frozen=True)
@@ -65,15 +69,18 @@ def load_settings(name: str, overrides: Sequence[str], convention: str = "auto")
 
     Args:
         name: A filter or the path of a preset.
-        overrides: "parameter=value" in YAML.
+        overrides: "key=value" in YAML. Keys are the filter's parameters, and the other fields of
+            `FilterSettings`: "overrides.velocity_scale=2", "on_invalid=mask", "layers=[luma]".
         convention: Whose channel names and units.
 
     Raises:
         ConfigError: unknown filter, parameter or convention, value out of range.
     """
-    settings = FilterSettings(
-        filter=name, params=apply_overrides({}, overrides), convention=convention
-    )
+    given = apply_overrides({}, overrides)
+    fields = {key: value for key, value in given.items() if key in _SETTINGS}
+    params = {key: value for key, value in given.items() if key not in _SETTINGS}
+    data = {"convention": convention} | fields | {"filter": name, "params": params}
+    settings = build(FilterSettings, data, "--set")
     make_filter(settings)
     return settings
 
@@ -203,7 +210,8 @@ def judge(
     Returns:
         By name, what `evaluate` returns over the image and over "band", the pixels that moving
         borders sweep. The asked filter stands under its name, with "(asked)" if it is a baseline
-        with other settings.
+        with other settings. A baseline that needs a layer which the frame lacks is left out, with
+        a warning.
 
     Raises:
         FrameError: sizes that differ.
@@ -212,7 +220,10 @@ def judge(
     asked = asked_name(blur)
     images = {"sharp": frame.color}
     for name in BASELINES:
-        images[name] = color if name == asked else _with_shutter_of(blur, name)(frame)
+        try:
+            images[name] = color if name == asked else _with_shutter_of(blur, name)(frame)
+        except FrameError as error:
+            warnings.warn(f"{name} is left out of the comparison: {error}", stacklevel=2)
     images.setdefault(asked, color)
     return {
         name: {k: float(v) for k, v in evaluate(image, reference, masks=band).items()}
@@ -230,11 +241,12 @@ def mean_scores(scores: Sequence[Mapping[str, Mapping[str, float]]]) -> dict[str
     """Return the mean over frames of what `judge` returned; frames with an empty band don't count.
 
     Args:
-        scores: One entry per frame, with the same names.
+        scores: One entry per frame; names that not all of them have are left out.
     """
     return {
         name: {key: _mean([frame[name][key] for frame in scores]) for key in scores[0][name]}
         for name in scores[0]
+        if all(name in frame for frame in scores)
     }
 
 

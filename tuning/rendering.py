@@ -116,7 +116,7 @@ def render_sequence(
             "replaces it"
         )
     todo = [task for task in tasks if overwrite or states[task.path] != "done"]
-    make_folders([folder])
+    make_folders([task.path for task in tasks])
     remove_leftovers([task.path for task in todo])
     stage = Stage("render", len(todo), progress)
     stage.step(0)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
-from tiny_shots import HEIGHT, WIDTH, moving_square, write_shot
+from tiny_shots import HEIGHT, WIDTH, moving_square, write_channels, write_shot
 from typer.testing import CliRunner
 
 from torchblur.filters import get_filter, registered_filters
@@ -126,6 +126,40 @@ class TestFilter:
         run("filter", "line", shot[0], "-o", tmp_path / "b.exr", "--set", "num_samples=5")
         assert torch.equal(read_image(tmp_path / "a.exr"), read_image(tmp_path / "b.exr"))
 
+    def test_set_reaches_how_files_are_read_and_written(self, shot, tmp_path):
+        run(
+            "filter",
+            "guertin2014",
+            shot[0],
+            "-o",
+            tmp_path / "out.exr",
+            "--set",
+            "overrides.velocity_scale=0.5",
+            "--set",
+            "layers=[luma]",
+            "--set",
+            "num_samples=5",
+        )
+        with torch.no_grad():
+            blur = create_filter("guertin2014", num_samples=5)
+            want = blur.layers(read_frame(shot[0], velocity_scale=0.5))
+        torch.testing.assert_close(read_image(tmp_path / "out.exr"), want["color"].half().float())
+        torch.testing.assert_close(read_channels(tmp_path / "out.exr", "luma"), want["luma"])
+
+    def test_channels_can_be_named(self, shot, tmp_path):
+        write_channels(
+            tmp_path / "odd.exr",
+            velocity_X=None,
+            velocity_Y=None,
+            mv_a=torch.zeros(48, 64),
+            mv_b=torch.zeros(48, 64),
+        )
+        args = ("filter", "line", tmp_path / "odd.exr", "-o", tmp_path / "out.exr")
+        run(*args, code=2)
+        run(*args, "--set", "overrides.velocity=[mv.a, mv.b]")
+        sharp = read_image(tmp_path / "odd.exr").half().float()
+        torch.testing.assert_close(read_image(tmp_path / "out.exr"), sharp)
+
     def test_png_is_srgb(self, shot, tmp_path):
         run("filter", "line", shot[0], "-o", tmp_path / "out.png")
         run("filter", "line", shot[0], "-o", tmp_path / "out.exr")
@@ -188,6 +222,24 @@ class TestFilter:
         output = run("filter", "line", shot[0], "--reference", reference).output
         assert output.count("  line ") + output.count("> line ") == 1
         assert "> line" in output
+
+    def test_baselines_that_need_more_layers_are_left_out(self, shot, tmp_path):
+        write_channels(tmp_path / "flat.exr", Z=None)
+        reference = shot[0].parent / "reference.0001.exr"
+        command = [
+            sys.executable,
+            "-c",
+            "from tuning.cli import main; main()",
+            "filter",
+            "line",
+            tmp_path / "flat.exr",
+            "--reference",
+            reference,
+        ]
+        done = subprocess.run(command, capture_output=True, text=True, check=True)
+        assert "warning: mcguire2012 is left out" in done.stderr
+        assert "guertin2014" not in done.stdout
+        assert len(row(done.stdout, "line")) == 6
 
     def test_mean_over_a_sequence(self, shot):
         folder = shot[0].parent
@@ -267,9 +319,21 @@ class TestRender:
         variance = read_channels(file, "variance.R", "variance.G", "variance.B")
         torch.testing.assert_close(variance, want.variance)
 
-    def test_scene_by_name(self, scene, tmp_path):
-        self.render(scene.stem, tmp_path)
-        assert (tmp_path / f"{scene.stem}.0000.exr").exists()
+    def test_scene_by_name_and_a_new_folder(self, scene, tmp_path):
+        self.render(scene.stem, tmp_path / "deep/new")
+        assert (tmp_path / f"deep/new/{scene.stem}.0000.exr").exists()
+
+    def test_ctrl_c_keeps_what_is_done(self, scene, tmp_path, monkeypatch):
+        import tuning.rendering
+
+        def interrupted(*args, **kwargs):
+            raise KeyboardInterrupt
+
+        with monkeypatch.context() as patch:
+            patch.setattr(tuning.rendering, "render_reference", interrupted)
+            result = run("render", scene, "-o", tmp_path, "--size", "64x48", code=130)
+        assert "the same command goes on" in result.stderr
+        assert [path.name for path in tmp_path.iterdir()] == [f"{scene.stem}.0000.exr"]
 
     def test_goes_on_where_it_stopped(self, scene, tmp_path):
         self.render(scene, tmp_path)

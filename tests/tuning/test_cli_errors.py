@@ -65,6 +65,12 @@ class TestFilter:
         message = blur("--set", "num_sample=3")
         assert "unknown key `num_sample` (did you mean `num_samples`?)" in message
 
+    def test_bad_setting(self, blur):
+        assert "`on_invalid`" in blur("--set", "on_invalid=maks")
+        message = blur("--set", "overrides.velocity_scal=2")
+        assert "did you mean `velocity_scale`?" in message
+        assert "--set" in message
+
     def test_out_of_range(self, blur):
         message = blur("--set", "kappa=-1.5")
         assert "`kappa` must lie in [1, 1000], got -1.5" in message
