@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import functools
-import importlib
-import warnings
 from collections.abc import Callable
 from types import FunctionType
 from typing import Any, Literal
@@ -12,6 +10,7 @@ from typing import Any, Literal
 import torch
 
 from torchblur.errors import ConfigError
+from torchblur.ops.compiling import compiler_errors, load_compiler, warn_no_compiler
 
 __all__ = ["Engine", "check_engine", "execute"]
 
@@ -48,14 +47,10 @@ def execute(function: Callable[..., Any], compile_it: bool, *arguments: Any) -> 
     if compile_it and _state["works"]:
         try:
             return _compiled(function)(*arguments)
-        except _compiler_errors() as error:
+        except compiler_errors() as error:
             _state["works"] = False
             reason = (str(error).splitlines() or [type(error).__name__])[0]
-            warnings.warn(
-                f"torch.compile does not work here ({reason}); references are rendered without "
-                "it, several times slower",
-                stacklevel=2,
-            )
+            warn_no_compiler(reason)
     return function(*arguments)
 
 
@@ -67,16 +62,5 @@ def _compiled(function: Callable[..., Any]) -> Callable[..., Any]:
     own = FunctionType(
         code, function.__globals__, function.__name__, function.__defaults__, function.__closure__
     )
-    with warnings.catch_warnings():
-        # torch warns of itself where it is loaded; that is no news to our user.
-        warnings.simplefilter("ignore", DeprecationWarning)
-        importlib.import_module("torch._inductor.compile_fx")
+    load_compiler()
     return torch.compile(own, dynamic=False, fullgraph=True)
-
-
-def _compiler_errors() -> tuple[type[Exception], ...]:
-    """Errors of torch.compile itself; what else goes wrong is not hidden."""
-    from torch._dynamo.exc import BackendCompilerFailed  # imported late: it is slow to load
-    from torch._inductor.exc import InductorError
-
-    return BackendCompilerFailed, InductorError
