@@ -205,6 +205,7 @@ def make_view(
     *,
     subtitle: str = "",
     mapped: Sequence[str] = (),
+    right: str = "reference",
 ) -> View:
     """Return the comparison of several images with a reference.
 
@@ -212,9 +213,10 @@ def make_view(
         key: Unique name within the page.
         title: Heading.
         images: Scene-linear radiance by label, (1, 3, H, W) each; the first is on the left.
-        reference: Scene-linear radiance, (1, 3, H, W); on the right.
+        reference: Scene-linear radiance, (1, 3, H, W); labeled "reference".
         subtitle: What it is.
         mapped: Labels of the images whose error maps are shown; all if left out.
+        right: Label of what is on the right at first.
     """
     errors = {name: flip_ldr(image, reference) for name, image in images.items()}
     shown = list(mapped) or list(images)
@@ -242,7 +244,7 @@ def make_view(
         height=height,
         pictures=pictures,
         left=pictures[0].name,
-        right="reference",
+        right=right,
         maps=maps,
         limit=limit,
     )

@@ -38,6 +38,7 @@ _STYLE: Any = {
     "grid.alpha": 0.2,
     "legend.frameon": False,
 }
+_WIDE = 60  # ratio of the ends of an axis above which only powers of ten are labeled
 Records = Sequence[Mapping[str, Any]]
 
 
@@ -147,7 +148,9 @@ def _draw_slice(
 
 def _plain_numbers(axis: Axis) -> None:
     """Label a logarithmic axis with a few plain numbers."""
-    axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0), numticks=6))
+    low, high = axis.get_view_interval()
+    subs = (1.0, 2.0, 5.0) if high / low < _WIDE else (1.0,)
+    axis.set_major_locator(LogLocator(subs=subs, numticks=6))
     axis.set_minor_locator(NullLocator())
     axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
 

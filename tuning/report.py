@@ -124,12 +124,19 @@ def verdict_of(result: FitResult) -> Verdict:
     psnr = [result.mean(variant, split, "psnr") for variant in ("default", "tuned")]
     if None not in psnr:
         text += f", PSNR from {psnr[0]:.2f} to {psnr[1]:.2f} dB"
+    text += f". {_at_borders(result, split)}" if result.mean("tuned", split, "flip_band") else ""
     line = result.mean("line", split, "flip")
     if line is not None:
-        text += f"; a plain line blur has FLIP {line:.4f}"
-        if after >= line:
-            text += ", which the tuned filter does not beat"
+        beaten = "beats" if after < line else "does not beat"
+        text += f". The tuned filter {beaten} a plain line blur (FLIP {line:.4f})"
     return Verdict(after < before, text + ".")
+
+
+def _at_borders(result: FitResult, split: str) -> str:
+    figures = [result.mean(v, split, "flip_band") for v in ("default", "tuned", "line")]
+    before, after, line = (math.nan if value is None else value for value in figures)
+    text = f"At moving borders FLIP goes from {before:.4f} to {after:.4f}"
+    return text if math.isnan(line) else f"{text}; the line blur has {line:.4f} there"
 
 
 def figures_table(result: FitResult, split: str) -> Table | None:
@@ -172,6 +179,7 @@ def _view(index: int, case: Case, variants: Sequence[Variant]) -> View:
         subtitle=f"{_SPLITS[case.split]} · shutter {case.shutter.open:g} frame, "
         f"{case.shutter.position}",
         mapped=[name for name in ("default", "tuned", "line") if name in images],
+        right="tuned",
     )
 
 
@@ -269,16 +277,14 @@ def _case_table(result: FitResult) -> Table:
     for case, variants in by_case.items():
         values: list[float | None] = []
         for metric in ("flip", "psnr", "flip_band"):
-            before, after = variants["default"][metric], variants["tuned"][metric]
-            known = before is not None and after is not None
-            values += [before, after, after - before if known else None]  # type: ignore[operator]
+            values += [variants["default"][metric], variants["tuned"][metric]]
         rows.append(Row(name=case, values=values, note=_SPLITS[splits[case]].lower()))
     columns = [
-        Column(name=f"{label}{what}", digits=digits, signed=what == " change")
-        for label, digits in (("FLIP", 4), ("PSNR", 2), ("borders", 4))
-        for what in (" before", " after", " change")
+        Column(name=f"{label} {what}", digits=digits)
+        for label, digits in (("FLIP", 4), ("PSNR", 2), ("FLIP, borders", 4))
+        for what in ("before", "after")
     ]
-    return Table(title="“borders”: FLIP in the band", columns=columns, rows=rows)
+    return Table(title="", columns=columns, rows=rows)
 
 
 def _short(value: Any) -> str:

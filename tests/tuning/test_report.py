@@ -219,6 +219,8 @@ class TestBrowser:
         def clip():
             return over.evaluate("image => getComputedStyle(image).clipPath")
 
+        assert view.locator("img.under").get_attribute("data-name") == "default"
+        assert over.get_attribute("data-name") == "tuned"
         assert clip() == "inset(0px 0px 0px 50%)"
         slider.focus()
         page.keyboard.press("ArrowRight")
