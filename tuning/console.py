@@ -179,7 +179,11 @@ def plain_table(title: str, columns: Sequence[str], *, right: Sequence[str] = ()
 
 
 def metrics_table(
-    title: str, rows: Mapping[str, Mapping[str, float]], *, highlight: str = ""
+    title: str,
+    rows: Mapping[str, Mapping[str, float]],
+    *,
+    highlight: str = "",
+    unranked: Sequence[str] = (),
 ) -> Table:
     """Return a table of FLIP, PSNR and SSIM over the image and, if there, over masks.
 
@@ -189,14 +193,16 @@ def metrics_table(
         title: Heading.
         rows: By name, values as `torchblur.metrics.evaluate` names them: "flip", "psnr_band" …
         highlight: The row that the reader asked for; it is marked.
+        unranked: Rows that are bounds, not competitors: they are never the best.
     """
     keys = [key for key in next(iter(rows.values())) if key.partition("_")[0] in _METRICS]
     labels = {key: _label(key) for key in keys}
     table = plain_table(title, ["", *labels.values()], right=list(labels.values()))
-    best = {key: _best(key, [row[key] for row in rows.values()]) for key in keys}
+    ranked = [row for name, row in rows.items() if name not in unranked]
+    best = {key: _best(key, [row[key] for row in ranked]) for key in keys}
     for name, row in rows.items():
         cells = [
-            Text(number_text(key, row[key]), style="bold" if row[key] == best[key] else "")
+            Text(number_text(key, row[key]), style=_style(name, row[key], best[key], unranked))
             for key in keys
         ]
         marked = name == highlight
@@ -209,6 +215,12 @@ def number_text(key: str, value: float) -> str:
     if math.isnan(value):
         return "–"
     return format(value, _METRICS[key.partition("_")[0]][1])
+
+
+def _style(name: str, value: float, best: float, unranked: Sequence[str]) -> str:
+    if name in unranked:
+        return "dim"
+    return "bold" if value == best else ""
 
 
 def _label(key: str) -> str:

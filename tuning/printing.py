@@ -32,6 +32,7 @@ __all__ = [
 
 _WIDE = 150
 _SCORES = ("flip", "psnr", "ssim", "flip_band", "psnr_band", "ssim_band")
+_BOUNDS = ("ceiling", "noise")
 _SHOWN = ("sharp", "line", "default", "tuned", "ceiling", "noise")
 
 
@@ -205,7 +206,7 @@ def print_fit(result: FitResult, folder: Path) -> None:
         rows = {name: _means(result, name, split) for name in _SHOWN if name in result.variants()}
         rows = {name: row for name, row in rows.items() if row["flip"] == row["flip"]}
         if rows:
-            results.print(metrics_table(title, rows, highlight="tuned"))
+            results.print(metrics_table(title, rows, highlight="tuned", unranked=_BOUNDS))
     table = plain_table("parameters", ["", "default", "tuned", "unit"], right=["default", "tuned"])
     for row in result.parameters:
         unit = "" if row.unit == "1" else row.unit
