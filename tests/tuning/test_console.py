@@ -15,7 +15,7 @@ def bold_cells(table):
 
 
 class TestMetricsTable:
-    ROWS = {  # noqa: RUF012
+    ROWS = {
         "sharp": {"flip": 0.3, "psnr": 20.0},
         "tuned": {"flip": 0.1, "psnr": 30.0},
         "noise": {"flip": 0.01, "psnr": 50.0},
