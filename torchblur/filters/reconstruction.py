@@ -135,7 +135,7 @@ class ReconstructionConfig(FilterConfig):
     depth_level: Annotated[
         float,
         Param(
-            low=0.25,
+            low=0.0,
             high=1.0,
             grad="smooth",
             source="1 in McGuire 2012, section 3.3; 1/2 in Jimenez 2014",
