@@ -36,6 +36,7 @@ class Outer(Config):
         default_factory=list
     )
     needed: str
+    terms: dict[Literal["flip", "ssim"], float] = Field(default_factory=dict)
 
 
 @pytest.mark.parametrize(
@@ -59,6 +60,7 @@ class Outer(Config):
         ),
         ({"methods": [{"kind": "rigth"}]}, r"'left', 'right'.*methods.0"),
         ({"needed": None}, r"`needed`: .*string, got None"),
+        ({"terms": {"flop": 1.0}}, r"`flop`: .*'flip' or 'ssim', got 'flop' \(f: terms.flop\)"),
         ({}, r"`needed` is required and is missing \(f: needed\)"),
     ],
 )

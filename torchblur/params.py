@@ -233,6 +233,7 @@ def _keys_of(loc: tuple[int | str, ...], data: object) -> list[str]:
     """Return the key path as the file has it: without pydantic's tags of unions."""
     keys: list[str] = []
     current = data
+    loc = tuple(part for part in loc if part != "[key]")  # pydantic's mark of a mapping's key
     for position, part in enumerate(loc):
         if isinstance(current, dict) and part in current:
             current = current[part]
