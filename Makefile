@@ -44,7 +44,7 @@ bench: $(VENV)/.tune
 	$(BIN)/python -m tuning.bench
 
 images: $(VENV)/.tune
-	$(BIN)/python docs/make_images.py
+	$(BIN)/python -m tuning.pictures
 
 clean:
 	rm -rf $(VENV) runs out
