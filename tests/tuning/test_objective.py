@@ -108,14 +108,38 @@ def test_shutter_comes_from_the_data_unless_it_is_free():
     assert free[0] == free[1] != float(fixed)
 
 
-def test_a_set_without_a_finite_image_is_alone_with_it(monkeypatch, planted_problem):
+def test_a_free_shutter_without_a_value_is_the_filters_own():
+    case = planted_case(1)
+    objective = ObjectiveSpec(terms={"l1": 1.0})
+    own = problem_of([case], objective, free=("shutter",))
+    assert float(own.blur.shutter) == 0.5 != case.shutter.open
+    assert float(own.mean({})) == float(own.mean({"shutter": 0.5}))
+
+
+def test_windows_are_scored_where_they_are_not_context():
+    crops = Crops(size=16, per_frame=5, context=12)
+    problem = problem_of([planted_case(1)], ObjectiveSpec(terms={"l1": 1.0}), crops)
+    errors = []
+    for sample in problem.samples:
+        top, left, height, width = sample.inner
+        image = problem.blur(sample.frame, shutter=sample.shutter.open)
+        inner = image[..., top : top + height, left : left + width]
+        prepared = prepare_objective(problem.objective, sample.reference, sample.band)
+        errors.append(float(prepared(inner)))
+    assert any(sample.inner[:2] != (0, 0) for sample in problem.samples)
+    assert float(problem.mean({})) == pytest.approx(sum(errors) / len(errors), rel=1e-5)
+
+
+def test_a_set_without_a_finite_image_is_alone_with_it(monkeypatch):
+    problem = problem_of([planted_case(1)], ObjectiveSpec(terms={"flip": 1.0, "ssim": 1.0}))
+
     def broken(blur, frame, shutter, position, values, free):
         image = blurred(blur, frame, shutter, position, values, free)
         return torch.where(torch.tensor([False, True]).view(-1, 1, 1, 1), torch.nan, image)
 
     monkeypatch.setattr("tuning.problem.blurred", broken)
     values = {"kappa": torch.tensor([10.0, 10.0], dtype=torch.float64, requires_grad=True)}
-    losses = sum(planted_problem.losses(values, 2))
+    losses = sum(problem.losses(values, 2))
     losses[0].backward()
     assert torch.isfinite(losses).tolist() == [True, False]
     assert torch.isfinite(values["kappa"].grad).all()

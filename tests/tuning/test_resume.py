@@ -121,6 +121,24 @@ def test_interrupt_leaves_a_run_that_goes_on(config, tmp_path, whole, monkeypatc
     assert outcome(resumed) == outcome(whole[1])
 
 
+def test_killed_between_log_and_checkpoint(config, tmp_path, whole, monkeypatch):
+    calls = iter(range(100))
+    save_state = RunFolder.save_state
+
+    def save_or_stop(folder, name, state):
+        if next(calls) == 2:
+            raise StoppedError
+        save_state(folder, name, state)
+
+    monkeypatch.setattr(RunFolder, "save_state", save_or_stop)
+    with pytest.raises(StoppedError):
+        run_fit(config, tmp_path / "run")
+    assert len(losses(tmp_path / "run")) == 3
+    resumed = run_fit(config, tmp_path / "run", resume=True)
+    assert outcome(resumed) == outcome(whole[1])
+    assert losses(tmp_path / "run") == losses(whole[0])
+
+
 @pytest.mark.parametrize("sampler", ["tpe", "cmaes", "gp", "random"])
 def test_study_is_the_same_after_a_kill_within_a_trial(planted_problem, tmp_path, sampler):
     free = {"kappa": {}, "third_gain": {}, "tile_size": {"low": 6, "high": 12}}
