@@ -192,7 +192,6 @@ class _State:
         finite = torch.isfinite(losses) & torch.isfinite(grad).all(dim=1)
         dropped = (self.alive & ~finite).nonzero().flatten().tolist()
         self.alive &= finite
-        grad[~self.alive] = 0.0
         if not bool(self.alive.any()):
             values = self.job.space.from_unit(self.unit.detach())
             at = {name: value.tolist() for name, value in values.items()}

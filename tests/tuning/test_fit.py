@@ -95,6 +95,26 @@ class TestRecovery:
         result = fit_gradient(planted_problem, job)
         assert result.params == {"third_gain": 3.0}
 
+    def test_scale_of_the_objective_does_not_matter(self, planted_problem):
+        job = gradient_job(space_of(["third_gain"]), steps=4, starts=2)
+        found = []
+        for weight in (1.0, 1e-6):
+            terms = {"terms": {"l1": weight}}
+            planted_problem.objective = planted_problem.objective.model_copy(update=terms)
+            planted_problem._single.clear()
+            found.append(
+                [s.params["third_gain"] for s in fit_gradient(planted_problem, job).starts]
+            )
+        assert found[1] == pytest.approx(found[0], rel=1e-4)
+
+    def test_points_do_not_get_lost_outside_the_cube(self, planted_problem):
+        """Outside, where the range is clamped, there is no gradient that leads back."""
+        job = gradient_job(space_of({"third_gain": {"high": 3.0}}), starts=3, learning_rate=1.0)
+        state = tuning.gradient._State(job)
+        for _ in range(3):
+            state.advance(planted_problem)
+            assert bool(((state.unit >= 0) & (state.unit <= 1)).all())
+
 
 class TestSensitivity:
     def test_finite_differences_at_the_optimum(self, planted_problem):
