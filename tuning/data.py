@@ -1,11 +1,10 @@
-"""Frames with their references: scenes rendered once and cached, EXR files, windows to fit on."""
+"""Frames with their references: scenes, rendered once and cached, and EXR files."""
 
 from __future__ import annotations
 
 import dataclasses
 import hashlib
 import json
-import math
 import os
 import re
 import warnings
@@ -15,7 +14,6 @@ from pathlib import Path
 from typing import Any
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 
 import torchblur.render
@@ -24,12 +22,9 @@ from torchblur.frame import Frame, Shutter
 from torchblur.io import read_frame, read_image
 from torchblur.metrics import border_band
 from torchblur.render import load_scene, render_frame, render_reference
-from tuning.config import Crops, DataItem, DataSpec, ExrData, SceneData
+from tuning.config import DataItem, DataSpec, ExrData, SceneData
 
-__all__ = ["Case", "Sample", "cache_folder", "load_cases", "make_samples"]
-
-_MOVING = 0.5  # px over the open shutter; less is not seen as blur
-_CANDIDATE_STEPS = 8  # windows are placed on a grid of 1/8 of their size
+__all__ = ["Case", "cache_folder", "load_cases"]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -69,25 +64,6 @@ class Case:
         )
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Sample:
-    """A window of a case: what is filtered, and the part of it that is scored.
-
-    Args:
-        frame: The window with its context, a batch of 1.
-        reference: The scored part of the reference, (1, 3, h, w).
-        band: The scored part of the band, (1, 1, h, w).
-        inner: Top, left, height and width of the scored part within the window, px.
-        shutter: The shutter of the reference.
-    """
-
-    frame: Frame
-    reference: Tensor
-    band: Tensor
-    inner: tuple[int, int, int, int]
-    shutter: Shutter
-
-
 def load_cases(
     spec: DataSpec,
     *,
@@ -121,32 +97,6 @@ def load_cases(
         cases.append(job.load(split).to(device))
     _refuse_repeats(cases)
     return _with_unique_names(cases)
-
-
-def make_samples(
-    cases: Sequence[Case], crops: Crops | None, *, tile_size: int, seed: int
-) -> list[Sample]:
-    """Return what a fit evaluates: the full frames, or windows of them.
-
-    Windows are drawn where something moves: the chance of a place is its number of moving pixels.
-    A window is filtered with context around it, so that the filter's reach does not end at its
-    edge, and only the inner part is scored. Its origin is a multiple of the tile, so that tiles
-    lie as in the full frame.
-
-    Args:
-        cases: The frames.
-        crops: Windows, or None for full frames.
-        tile_size: Tile of the filter, px.
-        seed: Of the places.
-    """
-    if crops is None:
-        return [_full(case) for case in cases]
-    generator = torch.Generator().manual_seed(seed)
-    return [
-        _window(case, top, left, crops, tile_size)
-        for case in cases
-        for top, left in _places(case, crops, generator)
-    ]
 
 
 def cache_folder() -> Path:
@@ -385,57 +335,3 @@ def _renderer_hash() -> str:
         for file in sorted(Path(folder).glob("*.py")):
             digest.update(file.read_bytes())
     return digest.hexdigest()
-
-
-# -- windows ---------------------------------------------------------------------------------------
-
-
-def _full(case: Case) -> Sample:
-    return Sample(
-        frame=case.frame,
-        reference=case.reference,
-        band=case.band,
-        inner=(0, 0, *case.frame.size),
-        shutter=case.shutter,
-    )
-
-
-def _places(case: Case, crops: Crops, generator: torch.Generator) -> list[tuple[int, int]]:
-    """Draw top left corners, without repetition, where pixels move."""
-    height, width = (min(crops.size, edge) for edge in case.frame.size)
-    length = case.frame.velocity.norm(dim=1, keepdim=True) * case.shutter.open
-    moving = (length > _MOVING).to(device="cpu", dtype=torch.float64)
-    stride = max(1, crops.size // _CANDIDATE_STEPS)
-    share = F.avg_pool2d(moving, (height, width), stride=stride)[0, 0]
-    if not bool((share > 0).any()):
-        share = torch.ones_like(share)
-    count = min(crops.per_frame, int((share > 0).sum()))
-    chosen = torch.multinomial(share.flatten(), count, generator=generator)
-    columns = share.shape[1]
-    return [(int(i) // columns * stride, int(i) % columns * stride) for i in chosen]
-
-
-def _window(case: Case, top: int, left: int, crops: Crops, tile_size: int) -> Sample:
-    height, width = (min(crops.size, edge) for edge in case.frame.size)
-    context = 2 * tile_size if crops.context is None else crops.context
-    rows, columns = case.frame.size
-    outer_top, outer_height = _outer(top, height, rows, context, tile_size)
-    outer_left, outer_width = _outer(left, width, columns, context, tile_size)
-    inner = (top - outer_top, left - outer_left, height, width)
-    scored = (..., slice(top, top + height), slice(left, left + width))
-    return Sample(
-        frame=case.frame.crop(outer_top, outer_left, outer_height, outer_width),
-        reference=case.reference[scored],
-        band=case.band[scored],
-        inner=inner,
-        shutter=case.shutter,
-    )
-
-
-def _outer(start: int, length: int, edge: int, context: int, tile_size: int) -> tuple[int, int]:
-    """Return first pixel and length of a window with context along one axis."""
-    wanted = math.ceil((length + 2 * context) / tile_size + 1) * tile_size
-    if wanted >= edge:
-        return 0, edge
-    first = max(0, start - context) // tile_size * tile_size
-    return min(first, edge - wanted), wanted

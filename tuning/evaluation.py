@@ -13,12 +13,13 @@ from torch import Tensor
 from torchblur.filters import BlurFilter
 from torchblur.metrics import evaluate
 from tuning.config import GradientMethod, ObjectiveSpec
-from tuning.data import Case, make_samples
+from tuning.data import Case
 from tuning.gradient import GradientJob, fit_gradient
 from tuning.problem import Problem, blurred
 from tuning.progress import Stage
 from tuning.result import CaseScore
 from tuning.space import Space
+from tuning.windows import make_samples
 
 __all__ = ["Variant", "ceiling", "noise_scores", "render", "score_cases", "sensitivities"]
 

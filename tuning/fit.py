@@ -20,7 +20,7 @@ from torchblur.filters import BlurFilter, get_filter
 from torchblur.presets import Preset, save_preset
 from tuning.blackbox import BlackBoxJob, fit_blackbox
 from tuning.config import GradientMethod, TuneConfig, free_names, resolve
-from tuning.data import Case, load_cases, make_samples
+from tuning.data import Case, load_cases
 from tuning.evaluation import Variant, ceiling, score_cases, sensitivities
 from tuning.gradient import GradientJob, fit_gradient
 from tuning.problem import Problem
@@ -29,6 +29,7 @@ from tuning.report import write_report
 from tuning.result import CaseScore, FitResult, MethodResult, ParameterResult
 from tuning.runfolder import RunFolder, open_run
 from tuning.space import Space, make_space
+from tuning.windows import make_samples
 
 __all__ = ["run_fit"]
 

@@ -12,8 +12,8 @@ from torch import Tensor
 from torchblur.filters import BlurFilter
 from torchblur.frame import Frame
 from tuning.config import ObjectiveSpec
-from tuning.data import Sample
 from tuning.objective import PreparedObjective, prepare_objective
+from tuning.windows import Sample
 
 __all__ = ["Problem", "blurred"]
 

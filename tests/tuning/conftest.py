@@ -7,8 +7,8 @@ from planted import FIXED, PLANTED, planted_case, write_planted
 
 from torchblur.filters import get_filter
 from tuning.config import ObjectiveSpec
-from tuning.data import make_samples
 from tuning.problem import Problem
+from tuning.windows import make_samples
 
 
 @pytest.fixture(autouse=True)

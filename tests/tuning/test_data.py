@@ -13,7 +13,8 @@ from torchblur.errors import ConfigError, FileFormatError
 from torchblur.io import write_frame, write_image
 from torchblur.params import build
 from tuning.config import Crops, DataSpec
-from tuning.data import cache_folder, load_cases, make_samples
+from tuning.data import cache_folder, load_cases
+from tuning.windows import make_samples
 
 SCENE = """
 camera: {position: [0, 0, 5]}

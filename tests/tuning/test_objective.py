@@ -10,9 +10,9 @@ from planted import FIXED, PLANTED, planted_case, tiny_frame
 from torchblur.filters import get_filter
 from torchblur.metrics import flip_hdr, flip_ldr, ssim
 from tuning.config import Crops, ObjectiveSpec
-from tuning.data import make_samples
 from tuning.objective import prepare_objective
 from tuning.problem import Problem, blurred
+from tuning.windows import make_samples
 
 
 @pytest.fixture
