@@ -1,7 +1,7 @@
 import pytest
 import torch
 
-from torchblur.ops.noise import checkerboard, halton, halton_plane, noise_plane
+from torchblur.ops.noise import checkerboard, dither_2x2, halton, halton_plane, noise_plane
 
 
 def test_halton_by_hand():
@@ -35,3 +35,9 @@ def test_none_is_one_half_and_checkerboard_alternates():
     like = torch.zeros(1, 1, 3, 4)
     assert bool((noise_plane("none", like) == 0.5).all())
     assert checkerboard(like)[0, 0].tolist() == [[0, 1, 0, 1], [1, 0, 1, 0], [0, 1, 0, 1]]
+
+
+def test_the_dither_of_two_by_two():
+    dither = dither_2x2(torch.zeros(1, 3, 3, 4))[0, 0]
+    assert dither[:2, :2].tolist() == [[0.25, -0.25], [-0.25, 0.25]]
+    assert torch.equal(dither[:, 2:], dither[:, :2])

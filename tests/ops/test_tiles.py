@@ -1,7 +1,15 @@
 import pytest
 import torch
 
-from torchblur.ops.tiles import neighbor_max, tile_lookup, tile_max, tile_offset, tile_variance
+from torchblur.ops.tiles import (
+    neighbor_max,
+    neighbor_min,
+    tile_lookup,
+    tile_max,
+    tile_min,
+    tile_offset,
+    tile_variance,
+)
 from torchblur.ops.velocity import length
 
 
@@ -111,3 +119,21 @@ def test_half_of_the_pixels_at_an_edge_see_the_other_tile():
     along_x = (torch.arange(4)[:, None] + torch.arange(190, 200)) % 2 == 0
     assert 0.2 < float(edge[along_x].mean()) < 0.75
     assert float(length(offset).max()) <= 0.5 + 1e-5
+
+
+@pytest.mark.parametrize("size", [(1, 1), (8, 12), (9, 13), (3, 40)])
+def test_tile_min_is_the_least_of_what_lies_in_the_tile(size):
+    lengths = torch.rand(2, 1, *size)
+    tiles = tile_min(lengths, 4)
+    expected = [
+        [lengths[1, 0, y : y + 4, x : x + 4].min().item() for x in range(0, size[1], 4)]
+        for y in range(0, size[0], 4)
+    ]
+    assert tiles[1, 0].tolist() == expected
+    assert tile_min(lengths, 64).shape == (2, 1, 1, 1)
+
+
+def test_neighbor_min_by_hand():
+    tiles = torch.tensor([[5.0, 4, 3, 9, 9], [6, 7, 8, 9, 2]])
+    around = neighbor_min(tiles[None, None])[0, 0].tolist()
+    assert around == [[4, 3, 3, 2, 2], [4, 3, 3, 2, 2]]

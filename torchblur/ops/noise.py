@@ -12,6 +12,7 @@ from torchblur.ops.gather import pixel_grid
 __all__ = [
     "NoiseKind",
     "checkerboard",
+    "dither_2x2",
     "halton",
     "halton_plane",
     "interleaved_gradient_noise",
@@ -98,6 +99,23 @@ def checkerboard(like: Tensor) -> Tensor:
     """
     x, y = pixel_grid(like)
     return torch.remainder(x + y, 2)
+
+
+def dither_2x2(like: Tensor) -> Tensor:
+    """Return the ordered dither of 2x2 pixels, ``[[+¼, −¼], [−¼, +¼]]``.
+
+    Two neighbors shift their taps by half a step against each other, so that the mean of a
+    2x2 block has twice the taps.
+
+    Args:
+        like: Any tensor of the image's size, (B, C, H, W).
+
+    Returns:
+        Plus and minus one quarter, (1, 1, H, W).
+
+    Reference: Jimenez 2014, as in public ports.
+    """
+    return 0.25 - 0.5 * checkerboard(like)
 
 
 def noise_plane(kind: NoiseKind, like: Tensor, stream: int = 0, seed: int = 0) -> Tensor:

@@ -13,7 +13,15 @@ from torch import Tensor
 from torchblur.ops.gather import lookup, pixel_grid
 from torchblur.ops.velocity import direction, length
 
-__all__ = ["neighbor_max", "tile_lookup", "tile_max", "tile_offset", "tile_variance"]
+__all__ = [
+    "neighbor_max",
+    "neighbor_min",
+    "tile_lookup",
+    "tile_max",
+    "tile_min",
+    "tile_offset",
+    "tile_variance",
+]
 
 
 def tile_max(velocity: Tensor, tile_size: int) -> Tensor:
@@ -90,6 +98,37 @@ def _reaches_middle(neighbors: Tensor) -> Tensor:
     on_axis = ox * oy == 0
     reaches: Tensor = on_axis | (ox * oy * neighbors[:, :, 0] * neighbors[:, :, 1] > 0)
     return reaches
+
+
+def tile_min(size: Tensor, tile_size: int) -> Tensor:
+    """Return the least value in each tile of ``tile_size``² pixels.
+
+    Args:
+        size: Lengths in px, (B, 1, H, W).
+        tile_size: r, the edge of a tile in px, at least 1.
+
+    Returns:
+        Lengths in px, (B, 1, Ty, Tx).
+
+    Border: tiles at the right and lower edge hold what there is of them.
+    Reference: Jimenez 2014.
+    """
+    # ceil_mode: a window over the edge takes what lies inside.
+    return -F.max_pool2d(-size, tile_size, ceil_mode=True)
+
+
+def neighbor_min(tile_values: Tensor) -> Tensor:
+    """Return, for each tile, the least value of it and its eight neighbors.
+
+    Args:
+        tile_values: Values per tile, (B, 1, Ty, Tx).
+
+    Returns:
+        Values, (B, 1, Ty, Tx).
+
+    Border: tiles outside the image do not take part.
+    """
+    return -F.max_pool2d(-tile_values, 3, stride=1, padding=1)
 
 
 def tile_variance(tile_velocity: Tensor, min_length: float | Tensor = 0.5) -> Tensor:
