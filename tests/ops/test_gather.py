@@ -111,3 +111,39 @@ def test_without_a_compiler_there_is_one_notice_and_the_eager_result():
         [sys.executable, "-c", _NO_COMPILER], capture_output=True, text=True, check=False
     )
     assert done.returncode == 0, done.stderr
+
+
+def peak_tap(index, count, inputs, options):
+    x, y = pixel_grid(inputs["image"])
+    color = lookup(inputs["image"], x + index * inputs["step"], y, options)
+    return color, color * inputs["decay"]
+
+
+@pytest.mark.parametrize("num_maxima", [0, 1, 2])
+def test_the_last_accumulators_can_be_maxima(num_maxima):
+    inputs = make_inputs() | {"step": torch.tensor(1.0, dtype=torch.float64)}
+    results = []
+    for by_engine in (True, False):
+        leaves = {k: v.clone().requires_grad_() for k, v in inputs.items()}
+        if by_engine:
+            totals = gather(peak_tap, "nearest", 6, leaves, num_maxima=num_maxima)
+        else:
+            parts = [
+                peak_tap(torch.tensor(float(i)).double(), None, leaves, "nearest") for i in range(6)
+            ]
+            stacked = [torch.stack(p) for p in zip(*parts, strict=True)]
+            totals = [s.sum(0) if i < 2 - num_maxima else s.amax(0) for i, s in enumerate(stacked)]
+        # Border pixels are met more than once: how amax divides a tie is not our affair.
+        sum(t[..., :4].square().sum() for t in totals).backward()
+        results.append([*totals, leaves["image"].grad, leaves["decay"].grad])
+    for ours, theirs in zip(*results, strict=True):
+        assert torch.allclose(ours, theirs, atol=1e-10)
+
+
+def test_a_tied_maximum_gives_its_gradient_to_one_tap():
+    image = torch.ones(1, 1, 2, 3, dtype=torch.float64)
+    leaves = {"image": image, "step": image.new_tensor(1.0)}
+    leaves["decay"] = image.new_tensor(2.0).requires_grad_()
+    _, peak = gather(peak_tap, "nearest", 5, leaves, num_maxima=1)
+    peak.sum().backward()
+    assert float(leaves["decay"].grad) == 6.0

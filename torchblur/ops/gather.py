@@ -37,6 +37,8 @@ def gather(
     num_samples: int,
     inputs: Mapping[str, Tensor],
     engine: Engine = "eager",
+    *,
+    num_maxima: int = 0,
 ) -> tuple[Tensor, ...]:
     """Return the sums over ``num_samples`` taps of what the tap function returns.
 
@@ -48,12 +50,14 @@ def gather(
         inputs: Tensors by name: planes (B, C, H, W) and parameters that broadcast to them.
         engine: "eager", or "compiled" to compile the tap function with `torch.compile`; without
             a compiler there is one warning and the eager result.
+        num_maxima: So many accumulators, the last ones, are maxima over the taps, not sums.
 
     Returns:
         The accumulators, in the tap's order.
 
     Differentiable: once, in all floating `inputs`, with memory independent of N. Backward costs
-        about one forward and backward of each tap.
+        about one forward and backward of each tap. The gradient of a maximum goes to the first
+        tap that reaches it.
 
     Raises:
         ConfigError: if the engine has another name.
@@ -64,10 +68,10 @@ def gather(
     tensors = tuple(inputs.values())
     wanted = torch.is_grad_enabled() and any(t.requires_grad for t in tensors)
     for candidate in ("compiled", "eager") if engine == "compiled" else ("eager",):
-        step = _step(tap, options, candidate)
+        step = _step(tap, options, candidate, num_maxima)
         try:
             if wanted:
-                return _apply(step, num_samples, names, *tensors)
+                return _apply(step, num_samples, num_maxima, names, *tensors)
             with torch.no_grad():
                 return _sum_taps(step, num_samples, dict(inputs))
         except compiler_errors() as error:
@@ -82,19 +86,26 @@ class _Gather(torch.autograd.Function):
 
     @staticmethod
     def forward(
-        ctx: Any, step: _Step, num_samples: int, names: tuple[str, ...], *tensors: Tensor
+        ctx: Any,
+        step: _Step,
+        num_samples: int,
+        num_maxima: int,
+        names: tuple[str, ...],
+        *tensors: Tensor,
     ) -> tuple[Tensor, ...]:
         ctx.step, ctx.num_samples, ctx.names = step, num_samples, names
-        ctx.save_for_backward(*tensors)
-        return _sum_taps(step, num_samples, dict(zip(names, tensors, strict=True)))
+        totals = _sum_taps(step, num_samples, dict(zip(names, tensors, strict=True)))
+        ctx.num_maxima = num_maxima
+        ctx.save_for_backward(*tensors, *totals[len(totals) - num_maxima :])
+        return totals
 
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
-        needed = ctx.needs_input_grad[3:]
-        leaves = [
-            t.detach().requires_grad_(n) for t, n in zip(ctx.saved_tensors, needed, strict=True)
-        ]
+        needed = ctx.needs_input_grad[4:]
+        saved, peaks = ctx.saved_tensors[: len(needed)], ctx.saved_tensors[len(needed) :]
+        leaves = [t.detach().requires_grad_(n) for t, n in zip(saved, needed, strict=True)]
+        taken = [torch.zeros_like(peak, dtype=torch.bool) for peak in peaks]
         wanted = [leaf for leaf, n in zip(leaves, needed, strict=True) if n]
         totals = [torch.zeros_like(leaf) for leaf in wanted]
         inputs = dict(zip(ctx.names, leaves, strict=True))
@@ -102,7 +113,9 @@ class _Gather(torch.autograd.Function):
         for index in range(ctx.num_samples):
             with torch.enable_grad():
                 added = ctx.step((), _scalar(index, leaves[0]), count, inputs)
-            pairs = [(a, g) for a, g in zip(added, grads, strict=True) if a.requires_grad]
+            split = len(added) - ctx.num_maxima
+            due = *grads[:split], *_due(added[split:], peaks, taken, grads[split:])
+            pairs = [(a, g) for a, g in zip(added, due, strict=True) if a.requires_grad]
             parts = torch.autograd.grad(
                 [a for a, _ in pairs], wanted, [g.expand_as(a) for a, g in pairs], allow_unused=True
             )
@@ -110,7 +123,23 @@ class _Gather(torch.autograd.Function):
                 if part is not None:
                     total += part
         result = iter(totals)
-        return (None, None, None, *(next(result) if n else None for n in needed))
+        return (None, None, None, None, *(next(result) if n else None for n in needed))
+
+
+def _due(
+    added: tuple[Tensor, ...],
+    peaks: tuple[Tensor, ...],
+    taken: list[Tensor],
+    grads: tuple[Tensor, ...],
+) -> list[Tensor]:
+    """Return the gradients of the maxima where this tap is the first to reach them."""
+    due = []
+    for value, peak, before, grad in zip(added, peaks, taken, grads, strict=True):
+        # Recomputed by another graph, a value may differ in its last bits.
+        first = (value.detach() >= peak - 1e-6 * peak.abs()) & ~before
+        before |= first
+        due.append(grad * first)
+    return due
 
 
 _apply: Callable[..., tuple[Tensor, ...]] = _Gather.apply
@@ -131,14 +160,19 @@ def _scalar(value: int, like: Tensor) -> Tensor:
 
 
 @functools.lru_cache(maxsize=64)
-def _step(tap: TapFunction, options: Hashable, engine: Engine) -> _Step:
+def _step(tap: TapFunction, options: Hashable, engine: Engine, num_maxima: int = 0) -> _Step:
     """Return the function that adds one tap to the sums; one object for each structure."""
 
     def step(
         sums: tuple[Tensor, ...], index: Tensor, count: Tensor, inputs: Inputs
     ) -> tuple[Tensor, ...]:
         added = tap(index, count, inputs, options)
-        return tuple(s + a for s, a in zip(sums, added, strict=True)) if sums else added
+        if not sums:
+            return added
+        split = len(added) - num_maxima
+        total = (s + a for s, a in zip(sums[:split], added[:split], strict=True))
+        largest = (torch.maximum(s, a) for s, a in zip(sums[split:], added[split:], strict=True))
+        return *total, *largest
 
     if engine == "compiled":
         load_compiler()
