@@ -1,11 +1,13 @@
 """The filters against slow per-pixel twins that were written from the papers alone."""
 
+import numpy as np
 import pytest
 import torch
 from twins.guertin2014 import guertin2014 as guertin_twin
 from twins.jimenez2014 import jimenez2014 as jimenez_twin
 from twins.line import line as line_twin
 from twins.mcguire2012 import mcguire2012 as mcguire_twin
+from twins.sousa2013 import sousa2013 as sousa_twin
 
 from torchblur.filters import get_filter
 from torchblur.ops.noise import noise_plane
@@ -65,12 +67,25 @@ CASES = {
         {"shutter_position": "leading", "tile_size": 16},
         {"shutter_position": "trailing", "depth_scale": 4.0, "num_samples": 6},
     ],
+    "sousa2013": [
+        {},
+        {"passes": 1, "tile_size": 7, "cylinder_outer": 1.3, "cylinder_inner": 0.5},
+        {"passes": 3, "num_samples": 3, "noise": "halton", "seed": 4},
+        {"pass_spread": 2.6, "num_samples": 5, "noise": "gradient", "jitter": 0.4},
+        {"encoding": "packed", "depth_range": 3.0, "tile_size": 9},
+        {"encoding": "packed", "shutter_position": "trailing"},
+        {"shutter_position": "leading", "soft_depth_extent": 0.4, "color_lookup": "bilinear"},
+        {"third_gain": 0.3, "foreground_gain": 3.0, "background_gain": 0.5, "depth_level": 0.7},
+        {"cone_slope": 0.5, "cone_exponent": 2.0, "center_gain": 7.0},
+        {"min_length": 2.0, "early_out": 1.5, "tile_size": 5, "shutter": 0.8},
+    ],
 }
 TWINS = {
     "line": line_twin,
     "mcguire2012": mcguire_twin,
     "guertin2014": guertin_twin,
     "jimenez2014": jimenez_twin,
+    "sousa2013": sousa_twin,
 }
 
 
@@ -89,6 +104,9 @@ def both(name, frame, params):
         planes["tap_noise"] = blur.config.jitter * planes["tap_noise"] / 2
     if name == "mcguire2012":
         del planes["tile_noise"]
+    if name == "sousa2013":
+        streams = [noise_plane(kind, frame.color, i, seed)[0, 0].numpy() for i in range(4)]
+        planes = {"tap_noise": 2 * np.stack(streams) - 1}
     return blur.layers(frame), TWINS[name](*arrays, **planes, **blur.config.model_dump())
 
 
@@ -105,7 +123,7 @@ def test_filter_equals_its_twin(name, params, make_frame):
     scale = min(1.0, 0.95 * reach / float(longest))
     frame = frame.map(lambda t: t * scale if t.shape[1] == 2 else t)
     layers, twin = both(name, frame, params)
-    for key in ("color", "luma", "alpha", "tile_class"):
+    for key in ("color", "luma", "alpha", "tile_class", "first_pass"):
         if key in layers:
             expected = torch.from_numpy(twin[key])[None]
             # float32 parameters and half-way roundings: a few pixels may take another neighbor.

@@ -7,6 +7,8 @@ from torchblur.ops.velocity import (
     direction,
     half_velocity,
     length,
+    quantize_gamma2,
+    quantize_linear,
     quantize_uint8,
     velocity_from_depth,
 )
@@ -78,3 +80,25 @@ def test_still_camera_gives_no_velocity_and_rotation_moves_all_depths_alike():
 def test_bad_matrix():
     with pytest.raises(FrameError, match=r"must be \(4, 4\) or \(B, 4, 4\), got \(3, 3\)"):
         velocity_from_depth(torch.ones(1, 1, 2, 2), torch.eye(3), torch.eye(4))
+
+
+def test_eight_bits_with_gamma_two_by_hand():
+    # code = round(√(|v| / 127²) · 127): the squares are stored exactly.
+    largest = float(127**2)
+    exact = torch.tensor([0.0, 1.0, -4.0, 100.0, -largest]).view(1, 1, 1, 5)
+    assert torch.allclose(quantize_gamma2(exact, largest), exact)
+    between = torch.tensor([2.2, -2.3, 6.3, 2 * largest]).view(1, 1, 1, 4)
+    expected = torch.tensor([1.0, -4.0, 9.0, largest]).view(1, 1, 1, 4)
+    assert torch.allclose(quantize_gamma2(between, largest), expected)
+
+
+def test_eight_bits_linear_by_hand():
+    values = torch.tensor([0.0, 0.4, 0.6, 100.2, 255.0, 1e10])
+    assert quantize_linear(values, 255.0).tolist() == [0, 0, 1, 100, 255, 255]
+
+
+@pytest.mark.parametrize("quantize", [quantize_gamma2, quantize_linear])
+def test_quantization_passes_the_gradient(quantize):
+    values = torch.tensor([0.0, 0.3, 2.7]).requires_grad_()
+    quantize(values, 4.0).sum().backward()
+    assert values.grad.tolist() == [1, 1, 1]

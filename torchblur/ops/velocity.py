@@ -14,6 +14,8 @@ __all__ = [
     "direction",
     "half_velocity",
     "length",
+    "quantize_gamma2",
+    "quantize_linear",
     "quantize_uint8",
     "velocity_from_depth",
 ]
@@ -92,6 +94,18 @@ class _RoundThrough(torch.autograd.Function):
         return grad
 
 
+class _StandIn(torch.autograd.Function):
+    """Another value in the place of one, with its gradient."""
+
+    @staticmethod
+    def forward(ctx: Any, value: Tensor, other: Tensor) -> Tensor:
+        return other.clone()
+
+    @staticmethod
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None]:
+        return grad, None
+
+
 def quantize_uint8(vector: Tensor, largest: float) -> Tensor:
     """Return the vectors as they come back from storage in eight bits per component.
 
@@ -109,6 +123,51 @@ def quantize_uint8(vector: Tensor, largest: float) -> Tensor:
     scale = _UINT8_STEPS / largest
     rounded: Tensor = _RoundThrough.apply(vector * scale)  # type: ignore[no-untyped-call]
     return rounded.clamp(-_UINT8_STEPS, _UINT8_STEPS) / scale
+
+
+def quantize_gamma2(vector: Tensor, largest: float) -> Tensor:
+    """Return the vectors as they come back from eight bits per component with a gamma of 2.
+
+    The code is ``sgn(v) · √|v|``, so that slow vectors keep more of their precision.
+
+    Args:
+        vector: Displacements with components in [-largest, largest] px, (B, 2, H, W).
+        largest: The component that the greatest code stands for, px.
+
+    Returns:
+        The nearest (in code) of the 255 values that can be stored, same shape.
+
+    Differentiable: straight through, the gradient of the identity.
+    Reference: Sousa 2013. We differ: symmetric codes around a 0 of its own, as in
+        `quantize_uint8`.
+    """
+    exact = vector.detach()
+    root = (exact.abs() / largest).sqrt().clamp(max=1.0)
+    code = (root * _UINT8_STEPS).round() / _UINT8_STEPS
+    stored: Tensor = _StandIn.apply(  # type: ignore[no-untyped-call]
+        vector, exact.sign() * code.square() * largest
+    )
+    return stored
+
+
+def quantize_linear(value: Tensor, largest: float | Tensor) -> Tensor:
+    """Return values as they come back from storage in eight bits; what is larger is cut.
+
+    Args:
+        value: Values >= 0, any shape.
+        largest: The value that the greatest code, 255, stands for.
+
+    Returns:
+        The nearest of the 256 values that can be stored.
+
+    Differentiable: straight through in the values, the gradient of the identity.
+    Reference: Sousa 2013 (length of the velocity, and depth).
+    """
+    code = ((value / largest).clamp(max=1.0) * 255).round()
+    stored: Tensor = _StandIn.apply(  # type: ignore[no-untyped-call]
+        value, (code / 255 * largest).detach()
+    )
+    return stored
 
 
 def velocity_from_depth(
