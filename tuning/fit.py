@@ -175,7 +175,7 @@ def _evaluate(
     result = FitResult(
         filter=setting.config.filter.kind,
         params=_not_default(setting.blur, params),
-        chosen=best.name if improved else "default",
+        chosen=best.name if improved else "start",
         start_objective=start_objective,
         objective=best.objective if improved else start_objective,
         parameters=_parameters(setting.space, tuned, rises),
@@ -193,13 +193,17 @@ def _evaluate(
 def _variants(
     setting: _Setting, methods: Sequence[MethodResult], tuned: dict[str, Any]
 ) -> list[Variant]:
-    """Return what is scored: sharp, line, the filter before and after, each method."""
+    """Return what is scored: sharp, line, the filter as published, before and after the fit."""
     blur, free = setting.blur, setting.space.names
     variants = [Variant(name="sharp")]
     if blur.name != "line":
         line = get_filter("line")().to(setting.cases[0].frame.device)
         variants.append(Variant(name="line", blur=line))
-    variants.append(Variant(name="default", blur=blur, values=setting.space.start(), free=free))
+    published = get_filter(blur.name)().to(setting.cases[0].frame.device)
+    variants.append(Variant(name="default", blur=published))
+    start = setting.space.start()
+    if _not_default(blur, setting.config.filter.params | start):
+        variants.append(Variant(name="start", blur=blur, values=start, free=free))
     if len(methods) > 1:
         variants += [Variant(name=m.name, blur=blur, values=m.params, free=free) for m in methods]
     return [*variants, Variant(name="tuned", blur=blur, values=tuned, free=free)]

@@ -33,7 +33,7 @@ __all__ = [
 _WIDE = 150
 _SCORES = ("flip", "psnr", "ssim", "flip_band", "psnr_band", "ssim_band")
 _BOUNDS = ("ceiling", "noise")
-_SHOWN = ("sharp", "line", "default", "tuned", "ceiling", "noise")
+_SHOWN = ("sharp", "line", "default", "start", "tuned", "ceiling", "noise")
 
 
 # -- parameters --------------------------------------------------------------------------------

@@ -34,7 +34,8 @@ _METRICS = {
 _NOTES = {
     "sharp": "no filter",
     "line": "line blur along each pixel's own motion",
-    "default": "before the fit",
+    "default": "as published",
+    "start": "before the fit: the fixed values of the config",
     "tuned": "after the fit",
     "ceiling": "parameters fitted to each frame alone",
     "noise": "a perfect image",
@@ -115,7 +116,7 @@ def verdict_of(result: FitResult) -> Verdict:
     split = "holdout" if result.mean("tuned", "holdout", "flip") is not None else "train"
     where = "hold-out frames, which the fit never saw" if split == "holdout" else "training frames"
     before, after = (result.mean(v, split, "flip") for v in ("default", "tuned"))
-    if result.chosen == "default":
+    if result.chosen == "start":
         return Verdict(False, "No method found anything better than the start values.")
     assert before is not None
     assert after is not None

@@ -69,7 +69,7 @@ class CaseScore(Config):
     case: str
     split: Split
     variant: str
-    """"default", "tuned", "gradient", "sharp", "line", "ceiling", "noise" …"""
+    """"default", "start", "tuned", "gradient", "sharp", "line", "ceiling", "noise" …"""
     scores: dict[str, float | None]
     """flip, psnr, ssim and the same with _band; null where the band is empty."""
 
@@ -81,7 +81,7 @@ class FitResult(Config):
     params: dict[str, Any]
     """All parameters that differ from the filter's defaults, the tuned ones included."""
     chosen: str
-    """Name of the method whose parameters these are; "default" if none was better."""
+    """Name of the method whose parameters these are; "start" if none was better."""
     start_objective: float
     objective: float
     parameters: tuple[ParameterResult, ...]

@@ -200,7 +200,9 @@ class TestFinishedRun:
 
     def test_result(self, finished):
         result = finished.result
-        assert result.variants() == ("sharp", "line", "default", "gradient", "tpe", "tuned")
+        assert result.variants() == (
+            "sharp", "line", "default", "start", "gradient", "tpe", "tuned",
+        )  # fmt: skip
         assert {(s.case, s.split) for s in result.scores} == {
             ("first", "train"), ("second", "holdout"),
         }  # fmt: skip
@@ -285,7 +287,7 @@ class TestRun:
     def test_nothing_better_than_the_start(self, planted_folders, tmp_path):
         planted_folders["filter"]["params"] |= PLANTED
         result = run_fit(build(TuneConfig, planted_folders), tmp_path / "run")
-        assert result.chosen == "default"
+        assert result.chosen == "start"
         assert {p.name: p.tuned for p in result.parameters} == PLANTED
 
     def test_ceiling_is_at_least_as_good(self, planted_folders, tmp_path):

@@ -140,7 +140,7 @@ class TestFigures:
             for s in result.scores
         ]
         assert not verdict_of(result.model_copy(update={"scores": tuple(swapped)})).good
-        unchanged = result.model_copy(update={"chosen": "default"})
+        unchanged = result.model_copy(update={"chosen": "start"})
         assert "better than the start values" in verdict_of(unchanged).text
 
 
