@@ -89,9 +89,9 @@ class TapPair(NamedTuple):
 def mirror(weights: TapPair, depths: TapPair, lengths: TapPair, rule: Mirror = "ports") -> TapPair:
     """Copy the weight of the nearer and faster of two taps to the other.
 
-    Inside a moving object, near its edge, one tap falls on the object and the other on what lies
-    beside it: with one weight for both, the object's share of the pair stands for both and the
-    gradient at the edge is smooth.
+    Beside a moving object one tap of a pair falls on it and the other on the background. With
+    the object's weight for both, what shows through the blur is the background around the
+    pixel, as smooth as the blur, and not the pixel's own color alone.
 
     Args:
         weights: Weights of the two taps, (B, 1, H, W).
