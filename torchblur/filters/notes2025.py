@@ -1,0 +1,215 @@
+"""The 2025 notes on motion blur rendering: Jimenez 2014 with two directions and a post-filter."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from torchblur.filters.base import BlurFilter, Values
+from torchblur.filters.notes2025_config import Notes2025Config
+from torchblur.filters.notes2025_gather import Blurred, Line, compose, gather_line, shared_inputs
+from torchblur.filters.notes2025_postfilter import post_filter
+from torchblur.filters.reconstruction import Spread
+from torchblur.frame import Frame, Shutter
+from torchblur.ops.directions import TileDirections, tile_directions
+from torchblur.ops.gather import Engine
+from torchblur.ops.noise import NoiseKind, noise_plane
+from torchblur.ops.resample import HalfImage, UpsampleRules, box_halve, depth_halve, upsample_over
+from torchblur.ops.tiles import neighbor_max, neighbor_min, tile_lookup, tile_max, tile_min
+from torchblur.ops.tiles import tile_offset as offset_of_tiles
+from torchblur.ops.velocity import clamp_length, direction, half_velocity, length, quantize_uint8
+
+__all__ = ["Notes2025Blur", "Notes2025Config", "notes2025"]
+
+
+def notes2025(frame: Frame, config: Notes2025Config | None = None, **params: Any) -> Tensor:
+    """Blur with the filter of the 2025 notes.
+
+    Along the dominant velocity of the tiles, and along a second direction that differs from it,
+    pairs of taps are weighted by depth, by spread and by direction. Foreground and background
+    are summed apart, ``lerp(bg, fg, max(α₁, α₂))``. Each foreground sample spreads its alpha over
+    ``1 + 2V`` px. A post-filter then fills the gaps between the taps. All of this may run at half
+    resolution; where the background is sharp, it is kept at full resolution.
+
+    Args:
+        frame: Color, depth and velocity, (B, ·, H, W).
+        config: Parameters; the defaults if left out.
+        **params: Single parameters over those of `config`.
+
+    Returns:
+        Color, scene-linear, (B, 3, H, W).
+
+    Differentiable: in color, in depth, in the velocity through the weights (not through the
+        positions of nearest lookups), and in every parameter that `torchblur params` calls
+        smooth. Tiles, the mirror filter and the hard thresholds of the post-filter choose, which
+        has no gradient.
+    Border: replicated.
+    Reference: "Notes On Motion Blur Rendering", 9 December 2025. We differ where the text leaves
+        a gap: depth ranges are guesses; the spread weight gives static pixels no background, or
+        the half resolution would never keep a sharp one; the second direction is reduced exactly
+        unless asked otherwise; with one sum for both (not `separate_sums`) two directions share
+        it; the alpha fade works in full-resolution px; taps and center of the post-filter; there
+        is no fast class of tiles, which changes cost only; shutters that are not centered shift
+        the taps along the velocity.
+    Raises: ConfigError for a bad parameter, FrameError if the frame has no depth.
+    """
+    result: Tensor = Notes2025Blur(config, **params)(frame)
+    return result
+
+
+class Notes2025Blur(BlurFilter):
+    """The filter of the 2025 notes; every section of the text is a switch. See `notes2025`.
+
+    `layers` adds "alpha" (the foreground's) and "output_alpha" (how much of the result replaces
+    the sharp color: at full resolution, after upsampling), "weight" (the larger of the mean
+    weights along the two directions) and "influence" (the longest half spread that took part,
+    px), all (B, 1, ·, ·), and "primary" and "secondary" (half spread per tile in px,
+    (B, 2, Ty, Tx)). With `resolution` "half" these but "output_alpha" have half the size and
+    px are half-resolution px; "half_color" and "half_alpha" are what was upsampled.
+    """
+
+    name = "notes2025"
+    config_class = Notes2025Config
+
+    def compute(self, frame: Frame, values: Values) -> dict[str, Tensor]:
+        """Return "color", the alphas, "weight", "influence" and the tiles."""
+        if values.resolution == "half":
+            return _half_layers(frame, values, self.engine)
+        return _layers(frame, values, self.engine)
+
+
+def _layers(frame: Frame, values: Values, engine: Engine) -> dict[str, Tensor]:
+    spread, tiles, least = _motion(frame, values)
+    offset = _tile_shift(frame.color, values)
+    first, second = (tile_lookup(t, frame.color, values.tile_size, offset) for t in tiles)
+    linear = tile_lookup(least, frame.color, values.tile_size, offset) >= values.bilinear_min
+    lines = _lines(first, second, linear, values)
+    shared = shared_inputs(frame, spread, linear, values)
+    sums = [gather_line(shared, line, values, engine) for line in lines]
+    image = compose(frame, sums, lines[0].used, values)
+    if values.resolution == "half" and values.alpha_fade:
+        image = _faded(image, values)
+    if values.post_filter:
+        image = post_filter(frame, image, lines, values, engine)
+    return image._asdict() | tiles._asdict()
+
+
+def _motion(frame: Frame, values: Values) -> tuple[Spread, TileDirections, Tensor]:
+    """Return half spreads per pixel, both directions per tile, and the least of the 3x3 tiles.
+
+    Tiles choose by the length before it is clamped: clamped vectors are all equally long, and
+    rounding would choose among them.
+    """
+    size = values.tile_size
+    longest = size / (1 + abs(Shutter(1, values.shutter_position).center))
+    whole = half_velocity(frame.velocity, values.shutter)
+    half = clamp_length(whole, longest)
+    if values.velocity_encoding == "uint8":
+        whole = half = quantize_uint8(half, size)
+    if values.directions == "one":
+        primary = neighbor_max(tile_max(whole, size), cull=values.neighbor_culling)
+        tiles = TileDirections(primary, torch.zeros_like(primary))
+    else:
+        tiles = tile_directions(
+            whole,
+            size,
+            reduction=values.direction_reduction,
+            cull=values.neighbor_culling,
+            exponent=_per_image(values.secondary_exponent),
+        )
+    tiles = TileDirections(*(clamp_length(tile, longest) for tile in tiles))
+    # Exactly 0 where still: a still pixel must not count, however little.
+    unit = direction(half)
+    spread = Spread(half, torch.where((unit == 0).all(1, True), 0.0, length(half)), unit)
+    return spread, tiles, neighbor_min(tile_min(spread.length.detach(), size))
+
+
+def _per_image(value: Tensor) -> Tensor:
+    """Return a parameter without its dependence on the pixel, for use per tile."""
+    return value.mean((-2, -1), keepdim=True) if value.ndim == 4 else value
+
+
+def _tile_shift(color: Tensor, values: Values) -> Tensor:
+    kind: NoiseKind = "gradient" if values.noise == "checkerboard" else values.noise
+    noise = noise_plane(kind, color, 1, values.seed)
+    return offset_of_tiles(color, noise, values.tile_size, values.tile_jitter)
+
+
+def _lines(first: Tensor, second: Tensor, linear: Tensor, values: Values) -> list[Line]:
+    """Return the directions that are sampled, and how densely."""
+    pairs = (values.num_samples + 1) // 2
+    plane = torch.full_like(first[:, :1], float(pairs))
+    moving = length(first) > values.early_out
+    doubled = torch.where(linear, plane, 2 * plane) if values.double_samples else plane
+    lines = [Line(first, moving, doubled, 2 * pairs if values.double_samples else pairs)]
+    if values.directions == "two":
+        unit = direction(first) * direction(second)
+        cosine = unit.sum(1, keepdim=True).abs()
+        apart = cosine < torch.cos(values.min_angle * (math.pi / 180))
+        used = moving & apart & (length(second) > values.early_out)
+        lines.append(Line(second, used, plane, pairs))
+    return lines
+
+
+# -- half resolution -------------------------------------------------------------------------------
+
+
+def _half_layers(frame: Frame, values: Values, engine: Engine) -> dict[str, Tensor]:
+    small_values = _halved(frame, values)
+    small = _half_frame(frame, small_values)
+    layers = _layers(small, small_values, engine)
+    layers["half_color"], layers["half_alpha"] = layers["color"], layers["output_alpha"]
+    rules = UpsampleRules(
+        values.upsample_depth_range,
+        values.depth_compare == "relative",
+        values.upsample_depth_weights,
+        values.alpha_weighted_color,
+        values.corner_fallback,
+    )
+    half = HalfImage(layers["half_color"], layers["half_alpha"], small.require("depth"))
+    layers["color"], layers["output_alpha"] = upsample_over(
+        frame.color, frame.finite_depth(), half, rules
+    )
+    return layers
+
+
+def _halved(frame: Frame, values: Values) -> Values:
+    """Return the parameters for half the size; what is given per pixel is averaged."""
+    small = {
+        key: box_halve(value)
+        if isinstance(value, Tensor) and value.ndim == 4 and value.shape[-2:] == frame.size
+        else value
+        for key, value in vars(values).items()
+    }
+    small["tile_size"] = (values.tile_size + 1) // 2
+    small["early_out"] = small["early_out"] / 2
+    return Values(**small)
+
+
+def _half_frame(frame: Frame, values: Values) -> Frame:
+    """Return the frame at half the size: plain color, motion and depth of what is nearest."""
+    depth = frame.finite_depth()
+    planes = depth_halve(
+        torch.cat((frame.velocity / 2, depth), 1),
+        depth,
+        values.downsample_depth_range,
+        relative=values.depth_compare == "relative",
+    )
+    color, valid = box_halve(frame.color), None
+    if frame.valid is not None:
+        share = box_halve(frame.valid.to(frame.dtype))
+        color = box_halve(frame.color * frame.valid.to(frame.dtype))
+        color = color / torch.where(share > 0, share, 1.0)
+        valid = share > 0
+    return Frame(color=color, velocity=planes[:, :2], depth=planes[:, 2:], valid=valid)
+
+
+def _faded(image: Blurred, values: Values) -> Blurred:
+    """Fade the output alpha where all motion is shorter than a half-resolution pixel."""
+    full_px = 2 * image.influence
+    t = ((full_px - values.fade_start) / (values.fade_end - values.fade_start)).clamp(0, 1)
+    factor = values.fade_min_alpha + (1 - values.fade_min_alpha) * t
+    return image._replace(output_alpha=image.output_alpha * factor)

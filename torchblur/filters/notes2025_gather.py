@@ -1,0 +1,299 @@
+"""The gather of the 2025 notes: weights of a pair of taps, and what is made of their sums."""
+
+from __future__ import annotations
+
+from typing import Literal, NamedTuple
+
+import torch
+from torch import Tensor
+
+from torchblur.filters.base import Values
+from torchblur.filters.reconstruction import Spread, Tap, sample, texture_of
+from torchblur.frame import Frame, Shutter
+from torchblur.ops.gather import Engine, Inputs, gather, lookup, pixel_grid
+from torchblur.ops.noise import dither_2x2, noise_plane
+from torchblur.ops.spread import Mirror, SpreadForm, TapPair, depth_shares, mirror, spread_weight
+from torchblur.ops.velocity import direction, length
+from torchblur.ops.weights import power, saturate
+
+__all__ = ["Blurred", "Line", "Sums", "compose", "gather_line", "shared_inputs"]
+
+_SHORTEST_REACH = 1e-3  # px; what is shorter has no direction either
+_PARAMETERS = ("depth_level", "spread_offset", "spread_slope", "direction_exponent", "area_slope")
+
+
+class Line(NamedTuple):
+    """One direction that is sampled, per pixel."""
+
+    vector: Tensor
+    """Half spread of the tile in px, (B, 2, H, W)."""
+    used: Tensor
+    """Whether it is sampled at all, bool, (B, 1, H, W)."""
+    pairs: Tensor
+    """Pairs of taps, (B, 1, H, W)."""
+    most_pairs: int
+    """The most that any pixel has."""
+
+
+class Sums(NamedTuple):
+    """Means over the taps of one line (the colors by their weights; the last a maximum)."""
+
+    background_color: Tensor
+    background: Tensor
+    foreground_color: Tensor
+    foreground: Tensor
+    alpha: Tensor
+    """Foreground's alpha in [0, 1], (B, 1, H, W)."""
+    influence: Tensor
+    """Longest half spread of the taps with a weight, px, (B, 1, H, W)."""
+
+
+class Blurred(NamedTuple):
+    """What the main pass leaves."""
+
+    color: Tensor
+    alpha: Tensor
+    """Foreground's alpha, (B, 1, H, W)."""
+    output_alpha: Tensor
+    """How much of the color must replace the sharp one: 1 over a blurred background."""
+    weight: Tensor
+    """Mean weight of the taps, in [0, 1], (B, 1, H, W)."""
+    influence: Tensor
+
+
+class _Options(NamedTuple):
+    center: int
+    relative_depth: bool
+    spread_form: SpreadForm
+    mirror: Mirror
+    direction_weights: bool
+    accurate_alpha: bool
+    softness: float
+    color_lookup: Literal["nearest", "bilinear", "opportunistic"]
+
+
+def shared_inputs(frame: Frame, spread: Spread, linear: Tensor, values: Values) -> Inputs:
+    """Return the planes that the taps of all lines look at.
+
+    Args:
+        frame: The frame.
+        spread: Its half spreads.
+        linear: Where the color may be looked up bilinearly, bool, (B, 1, H, W).
+        values: The parameters.
+    """
+    x, y = pixel_grid(frame.color)
+    if values.noise == "checkerboard":
+        shift = dither_2x2(frame.color)
+    else:
+        shift = noise_plane(values.noise, frame.color, 0, values.seed) - 0.5
+    relative = values.depth_compare == "relative"
+    inputs = {
+        "texture": texture_of(frame, spread),
+        "x": x,
+        "y": y,
+        "shift": shift * values.jitter,
+        "depth": frame.finite_depth(),
+        "half": spread.half,
+        "unit": spread.unit,
+        "length": spread.length,
+        "linear": linear.to(frame.dtype),
+        "depth_scale": 1 / (values.relative_depth_range if relative else values.depth_range),
+    }
+    return inputs | {key: getattr(values, key) for key in _PARAMETERS}
+
+
+def gather_line(shared: Inputs, line: Line, values: Values, engine: Engine) -> Sums:
+    """Sample along one line and return the means; zero where the line is not used.
+
+    Args:
+        shared: From `shared_inputs`.
+        line: Where to sample.
+        values: The parameters.
+        engine: Of the gather.
+    """
+    reach = length(line.vector).clamp_min(_SHORTEST_REACH)
+    unit = direction(line.vector)
+    own = (shared["unit"] * unit).sum(1, keepdim=True).abs()
+    inputs = shared | {
+        "direction": unit,
+        "reach": reach,
+        "pairs": line.pairs,
+        "own": power(own, shared["direction_exponent"]),
+    }
+    options = _Options(
+        Shutter(1, values.shutter_position).center,
+        values.depth_compare == "relative",
+        values.spread_compare,
+        values.mirror_filter,
+        values.direction_weights,
+        values.accurate_alpha,
+        values.softness,
+        values.color_lookup,
+    )
+    *totals, influence = gather(_pair, options, line.most_pairs, inputs, engine, num_maxima=1)
+    *sums, alpha = (total / (2 * line.pairs) for total in totals)
+    if values.accurate_alpha:
+        alpha = alpha * (1 + values.area_slope * reach)
+    alpha = saturate(values.alpha_gain * alpha, values.softness)
+    used = line.used.to(reach.dtype)
+    return Sums(*(plane * used for plane in (*sums, alpha, influence)))
+
+
+def _pair(index: Tensor, count: Tensor, inputs: Inputs, options: _Options) -> tuple[Tensor, ...]:
+    step, shift = ((part / inputs["pairs"]) for part in (index + 0.5, inputs["shift"]))
+    times = TapPair(*((side * step + shift).clamp(-1, 1) for side in (1, -1)))
+    taps, weights = zip(*(_tap(t, inputs, options) for t in times), strict=True)
+    mirrored = mirror(
+        TapPair(*weights),
+        TapPair(*(tap.depth for tap in taps)),
+        TapPair(*(tap.length for tap in taps)),
+        options.mirror,
+    )
+    taken = (index < inputs["pairs"]).to(step.dtype)
+    parts = [_parts(tap, taken * w) for tap, w in zip(taps, mirrored, strict=True)]
+    sums = (ahead + behind for ahead, behind in zip(parts[0][:5], parts[1][:5], strict=True))
+    return *sums, torch.maximum(parts[0][5], parts[1][5])
+
+
+def _parts(tap: Tap, weights: Tensor) -> tuple[Tensor, ...]:
+    background, foreground, alpha = weights.split(1, 1)
+    influence = torch.where(background + foreground > 0, tap.length, 0.0)
+    colors = background * tap.color, foreground * tap.color
+    if tap.valid is not None:
+        background, foreground = background * tap.valid, foreground * tap.valid
+    return colors[0], background, colors[1], foreground, alpha, influence
+
+
+def _tap(t: Tensor, inputs: Inputs, options: _Options) -> tuple[Tap, Tensor]:
+    """Return what lies at a time t in [-1, 1], and its weights.
+
+    Returns:
+        The tap; weights as background and foreground, and its alpha, (B, 3, H, W).
+    """
+    reach, unit = inputs["reach"], inputs["direction"]
+    along = (t + options.center) * reach
+    dx, dy = unit.split(1, 1)
+    tap = _look_up(inputs["x"] - along * dx, inputs["y"] - along * dy, inputs, options)
+    toward = tap.unit_x * dx + tap.unit_y * dy
+    distance_s = distance_p = along.abs()
+    if options.center:
+        moved_p = (inputs["half"] * unit).sum(1, keepdim=True)
+        distance_p = (along - options.center * moved_p).abs()
+        distance_s = (along - options.center * tap.length * toward).abs()
+    share = depth_shares(
+        inputs["depth"],
+        tap.depth,
+        inputs["depth_scale"],
+        level=inputs["depth_level"],
+        relative=options.relative_depth,
+        softness=options.softness,
+    )
+    background = share.background * _spread(distance_p, inputs["length"], inputs, options)
+    foreground = share.foreground * _spread(distance_s, tap.length, inputs, options)
+    if options.direction_weights:
+        background = background * inputs["own"]
+        foreground = foreground * power(toward.abs(), inputs["direction_exponent"])
+    alpha = foreground
+    if options.accurate_alpha:
+        alpha = saturate(foreground / (1 + inputs["area_slope"] * tap.length), options.softness)
+    return tap, torch.cat((background, foreground, alpha), 1)
+
+
+def _look_up(x: Tensor, y: Tensor, inputs: Inputs, options: _Options) -> Tap:
+    if options.color_lookup != "opportunistic":
+        return sample(inputs, x, y, options.color_lookup)
+    tap = sample(inputs, x, y, "nearest")
+    texture, linear = inputs["texture"], inputs["linear"] > 0
+    color = torch.where(linear, lookup(texture[:, :3], x, y, "bilinear"), tap.color)
+    if tap.valid is None:
+        return tap._replace(color=color)
+    valid = torch.where(linear, lookup(texture[:, 7:], x, y, "bilinear"), tap.valid)
+    return tap._replace(color=color, valid=valid)
+
+
+def _spread(distance: Tensor, size: Tensor, inputs: Inputs, options: _Options) -> Tensor:
+    per_px = inputs["pairs"] / inputs["reach"]
+    return spread_weight(
+        distance * per_px,
+        size * per_px,
+        offset=inputs["spread_offset"],
+        slope=inputs["spread_slope"],
+        form=options.spread_form,
+        softness=options.softness,
+    )
+
+
+# -- the sums' color -------------------------------------------------------------------------------
+
+
+def compose(frame: Frame, lines: list[Sums], moving: Tensor, values: Values) -> Blurred:
+    """Return the color of the main pass from the sums along one or two lines.
+
+    Args:
+        frame: The frame, for its color.
+        lines: Sums along the first and, if there is one, the second direction.
+        moving: Where the tile moves; elsewhere the color stays, bool, (B, 1, H, W).
+        values: The parameters.
+    """
+    total = Sums(*(torch.stack(planes).sum(0) for planes in zip(*lines, strict=True)))
+    influence = torch.stack([sums.influence for sums in lines]).amax(0)
+    weight = torch.stack([sums.background + sums.foreground for sums in lines]).amax(0)
+    if values.separate_sums:
+        alpha = _together([sums.alpha for sums in lines], values)
+        color, alpha, output = _separate(frame, total, alpha, values)
+    else:
+        alpha = _together([sums.background + sums.foreground for sums in lines], values)
+        color, alpha, output = _combined(frame, total, alpha)
+    color = torch.where(moving, color, frame.color)
+    planes = (torch.where(moving, p, 0.0) for p in (alpha, output, weight, influence))
+    return Blurred(color, *planes)
+
+
+def _together(alphas: list[Tensor], values: Values) -> Tensor:
+    stacked = torch.stack(alphas)
+    return stacked.amax(0) if values.alpha_combination == "max" else stacked.mean(0)
+
+
+def _separate(
+    frame: Frame, total: Sums, alpha: Tensor, values: Values
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Return color, alpha and output alpha: foreground over background.
+
+    With v for a valid background the whole is ``α fg + (1 − α) (v bg + (1 − v) sharp)``; what
+    is not the sharp color leaves here, with its share ``α + v − α v``.
+    """
+    has_foreground = total.foreground > 0
+    foreground = total.foreground_color / torch.where(has_foreground, total.foreground, 1.0)
+    alpha = torch.where(has_foreground, alpha, 0.0)
+    center = values.center_weight / (2 * _num_pairs(values))
+    if frame.valid is not None:
+        center = center * frame.valid.to(frame.dtype)
+    weight = total.background + center
+    background = total.background_color + center * frame.color
+    background = background / torch.where(weight > 0, weight, 1.0)
+    blurred = (total.background > 0).to(frame.dtype)
+    if values.background_fade > 0:
+        blurred = saturate(total.background / values.background_fade, values.softness)
+    output = alpha + blurred * (1 - alpha)
+    color = alpha * foreground + (1 - alpha) * blurred * background
+    if values.resolution == "full":
+        return color + (1 - output) * frame.color, alpha, output
+    own = output > 0
+    return torch.where(own, color / torch.where(own, output, 1.0), frame.color), alpha, output
+
+
+def _combined(frame: Frame, total: Sums, alpha: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Return the same from one sum, over the pixel's own color."""
+    weight = total.background + total.foreground
+    some = weight > 0
+    blurred = (total.background_color + total.foreground_color) / torch.where(some, weight, 1.0)
+    alpha = torch.where(some, alpha, 0.0)
+    share = alpha
+    if frame.valid is not None:  # an invalid pixel has no color of its own
+        share = torch.where(frame.valid | ~some, alpha, 1.0)
+    color = share * blurred + (1 - share) * frame.color
+    return color, alpha, alpha
+
+
+def _num_pairs(values: Values) -> int:
+    return int(values.num_samples + 1) // 2
