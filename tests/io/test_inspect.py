@@ -192,3 +192,11 @@ def test_the_beachball_is_seen_through(shared_data):
     assert any("`depth_right:Z` is half float" in w for w in found.warnings)
     assert any("alpha" in w for w in found.warnings)
     assert any("zeros, which are read as infinitely far" in note for note in found.notes)
+
+
+def test_an_infinite_background_is_nothing_wrong(tmp_path):
+    planes = content()
+    planes["Z"][:5] = np.inf
+    assert warnings_of(tmp_path / "a.exr", planes) == ()
+    planes["Z"][:5] = -np.inf
+    assert any("`Z` has 300 inf" in text for text in warnings_of(tmp_path / "a.exr", planes))

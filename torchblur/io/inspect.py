@@ -144,7 +144,7 @@ def inspect_file(
     file = read_exr(path)
     catalog = Catalog.of(file, view, layer)
     changed = build(ConventionOverrides, overrides, "inspect_file")
-    findings = _Findings([*_bad_values(catalog.planes)])
+    findings = _Findings([])
     chosen, frame = None, None
     try:
         chosen = resolve_convention(catalog, convention, changed)
@@ -154,6 +154,7 @@ def inspect_file(
             raise
         findings.warnings.append(str(error))
     roles = {} if chosen is None else _recognized(catalog, chosen)
+    findings.warnings[:0] = _bad_values(catalog.planes, roles.get("depth", ()))
     blur, signs = None, []
     if chosen is not None and frame is not None:
         blur = check_blur(frame.color, frame.velocity)
@@ -235,12 +236,16 @@ def _speeds(velocity: Tensor) -> VelocityInfo:
 # -- what looks wrong --------------------------------------------------------------------------
 
 
-def _bad_values(planes: Iterable[Plane]) -> Iterable[str]:
+def _bad_values(planes: Iterable[Plane], depth: Iterable[Plane]) -> Iterable[str]:
+    depth_labels = {plane.label for plane in depth}
     for plane in planes:
         array = plane.part.channels[plane.key]
-        num_nan, num_inf = int(np.isnan(array).sum()), int(np.isinf(array).sum())
+        infinite = np.isinf(array)
+        if plane.label in depth_labels and array.dtype != np.float16:
+            infinite &= array < 0  # +inf is a background; in half float it may be an overflow
+        num_nan, num_inf = int(np.isnan(array).sum()), int(infinite.sum())
         if num_nan or num_inf:
-            y, x = (int(i) for i in np.argwhere(~np.isfinite(array))[0])
+            y, x = (int(i) for i in np.argwhere(infinite | np.isnan(array))[0])
             what = " and ".join(
                 f"{count} {kind}" for count, kind in ((num_nan, "NaN"), (num_inf, "inf")) if count
             )
