@@ -123,6 +123,17 @@ def test_a_firefly_is_suppressed():
     assert torch.allclose(on, off, atol=1e-4)
 
 
+def test_only_the_first_downsampling_weighs_fireflies_down():
+    color = 4 * noise()
+    twice = downsample13(downsample13(color, 0.5, 1.0))
+    expected = upsample_tent(upsample_tent(twice, (11, 15)), (22, 30))
+    assert torch.allclose(bloom(color, num_levels=2, scatter=1.0, intensity=1.0), expected)
+    half = downsample13(color)
+    once = upsample_tent(downsample13(half, 0.5, 1.0), (11, 15))
+    out = bloom(color, half, num_levels=2, scatter=1.0, intensity=1.0)
+    assert torch.allclose(out, upsample_tent(once, (22, 30)))
+
+
 def test_more_scatter_and_more_levels_reach_further():
     def reach(**params):
         glow = Bloom(firefly_suppression=False, **params).layers(spot(96))["bloom"][0, 0].detach()
