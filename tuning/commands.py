@@ -329,6 +329,39 @@ def compare(
 
 
 @app.command()
+def ablate(
+    config: Annotated[
+        Path,
+        typer.Argument(
+            metavar="CONFIG", help="The claims and their scenes; configs/ablations has examples."
+        ),
+    ],
+    output: Annotated[
+        Path | None,
+        typer.Option("-o", "--output", metavar="DIR", help="Folder. Default: runs/CONFIG."),
+    ] = None,
+    set_: Set = None,
+    overwrite: Overwrite = False,
+) -> None:
+    """Measure claims: a filter with a feature off and on, against references of their scenes.
+
+    The folder gets table.md, table.json, and ablation.html with a slider for each claim.
+    """
+    from tuning.ablation import load_ablation_config, run_ablation
+    from tuning.ablation_files import check_outputs, write_ablation
+    from tuning.printing import print_ablation
+
+    folder = output or Path("runs") / config.stem
+    loaded = load_ablation_config(config, set_ or [])
+    check_outputs(folder, overwrite=overwrite)
+    with show_progress() as progress:
+        rows = run_ablation(loaded, progress)
+    files = write_ablation(folder, loaded, rows, overwrite=overwrite)
+    print_ablation(loaded, rows)
+    results.print(f"page: {files[-1]}", soft_wrap=True)
+
+
+@app.command()
 def params(
     filter_name: Annotated[
         str | None, typer.Argument(metavar="[FILTER]", help="Name of a filter. Default: all.")

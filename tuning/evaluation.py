@@ -21,7 +21,15 @@ from tuning.result import CaseScore
 from tuning.space import Space
 from tuning.windows import make_samples
 
-__all__ = ["Variant", "ceiling", "noise_scores", "render", "score_cases", "sensitivities"]
+__all__ = [
+    "Variant",
+    "ceiling",
+    "noise_scores",
+    "render",
+    "score_cases",
+    "score_image",
+    "sensitivities",
+]
 
 _STEP = 0.05  # of each range, for the sensitivities
 
@@ -71,7 +79,7 @@ def score_cases(
     scores: list[CaseScore] = []
     for done, case in enumerate(cases):
         for variant in variants:
-            scores.append(_score(case, variant.name, render(variant, case)))
+            scores.append(score_image(case, variant.name, render(variant, case)))
         if case.variance is not None:
             scores.append(noise_scores(case))
         if stage is not None:
@@ -91,7 +99,7 @@ def noise_scores(case: Case) -> CaseScore:
     assert case.variance is not None
     generator = torch.Generator().manual_seed(0)
     noise = torch.randn(case.reference.shape, generator=generator).to(case.reference)
-    return _score(case, "noise", case.reference + noise * case.variance.sqrt())
+    return score_image(case, "noise", case.reference + noise * case.variance.sqrt())
 
 
 def ceiling(
@@ -155,7 +163,14 @@ def sensitivities(problem: Problem, space: Space, values: Mapping[str, Any]) -> 
     return dict(zip(floats.names, worst, strict=True))
 
 
-def _score(case: Case, variant: str, image: Tensor) -> CaseScore:
+def score_image(case: Case, variant: str, image: Tensor) -> CaseScore:
+    """Return the figures of one image, over the image and over the band at moving borders.
+
+    Args:
+        case: The frame and its reference.
+        variant: The image's name in tables.
+        image: Scene-linear radiance, (1, 3, H, W).
+    """
     figures = evaluate(image, case.reference, masks={"band": case.band})
     return CaseScore(
         case=case.name,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, get_args
 
@@ -16,12 +16,23 @@ from torchblur.filters import BlurFilter, get_filter, registered_filters
 from torchblur.io import Inspection
 from torchblur.io.inspect import ChannelInfo
 from torchblur.params import Param, choices, declared
+from tuning.ablation import AblationConfig, Measured
+from tuning.ablation_files import RULE, tally
 from tuning.batch import BatchResult, Plan
-from tuning.console import log, metrics_table, plain_table, print_error, print_warning, results
+from tuning.console import (
+    log,
+    metrics_table,
+    number_text,
+    plain_table,
+    print_error,
+    print_warning,
+    results,
+)
 from tuning.outputs import State
 from tuning.result import FitResult
 
 __all__ = [
+    "print_ablation",
     "print_batch",
     "print_fit",
     "print_inspection",
@@ -33,6 +44,16 @@ __all__ = [
 _WIDE = 150
 _SCORES = ("flip", "psnr", "ssim", "flip_band", "psnr_band", "ssim_band")
 _BOUNDS = ("ceiling", "noise")
+_CLAIM_COLUMNS = (
+    "claim",
+    "verdict",
+    "scene",
+    "FLIP\noff, on",
+    "better\nby",
+    "PSNR\noff, on",
+    "time\non/off",
+)
+_TONES = {"shows": "green", "does not show": "red", "mixed": "yellow"}
 _SHOWN = ("sharp", "line", "default", "start", "tuned", "ceiling", "noise")
 
 
@@ -225,3 +246,31 @@ def _means(result: FitResult, variant: str, split: str) -> dict[str, float]:
 
 def _plain_short(value: Any) -> str:
     return f"{value:.4g}" if isinstance(value, float) else _plain(value)
+
+
+# -- claims ------------------------------------------------------------------------------------
+
+
+def print_ablation(config: AblationConfig, rows: Sequence[Measured]) -> None:
+    """Print the claims, each with its figures at moving borders and whether it shows."""
+    table = plain_table(config.title, _CLAIM_COLUMNS, right=_CLAIM_COLUMNS[3:])
+    for row in rows:
+        off, on = row.scores["off"], row.scores["on"]
+        share, ratio = row.gain("flip_band"), row.time_ratio
+        table.add_row(
+            Text(row.row.name),
+            Text(row.verdict, style=_TONES[row.verdict]),
+            Text(row.case.name),
+            f"{_figure('flip', off)}\n{_figure('flip', on)}",
+            "–" if share is None else f"{share:+.1%}",
+            f"{_figure('psnr', off)}\n{_figure('psnr', on)}",
+            "–" if ratio is None else f"{ratio:.2f}",
+        )
+    results.print(table)
+    results.print(Text(tally(rows), style="bold"))
+    results.print(Text(RULE, style="dim"))
+
+
+def _figure(metric: str, scores: Mapping[str, float | None]) -> str:
+    value = scores.get(f"{metric}_band")
+    return number_text(metric, float("nan") if value is None else value)

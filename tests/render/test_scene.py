@@ -16,7 +16,7 @@ GOOD = {"camera": {"position": [0, 0, 5]}, "bodies": [BALL]}
 CLAIMS = (
     "crossing_spheres", "thin_pole", "spinning_wheel", "overlapping_rotations", "towards_viewer",
     "static_foreground", "three_wheels", "sideways_camera", "spinning_cube", "crossing_boxes",
-    "fence",
+    "fence", "opposite_motion", "crosswise_motion", "double_dominant",
 )  # fmt: skip
 
 

@@ -21,7 +21,7 @@ from torchblur.presets import Preset, create_filter, save_preset
 from torchblur.render import load_scene, render_frame, render_reference
 from tuning.commands import app
 
-COMMANDS = ("tune", "filter", "batch", "render", "compare", "params", "inspect")
+COMMANDS = ("tune", "filter", "batch", "render", "compare", "ablate", "params", "inspect")
 
 
 @pytest.fixture(autouse=True)
