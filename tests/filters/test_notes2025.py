@@ -137,6 +137,23 @@ def test_alpha_is_right_where_the_tile_is_twice_as_fast(given):
     assert errors[False] > 2 * errors[True]
 
 
+def test_few_taps_have_the_right_alpha_with_half_a_tap_of_spread_offset():
+    # A tap stands for half a tap to both sides. With the slides' whole tap a blur reaches too far,
+    # which the accurate alpha then scales up where the tile is faster.
+    frame = two_layers(front=(32.0, 0.0))
+    velocity = frame.velocity.clone()
+    velocity[0, 0, 0, 0] = 44.0
+    frame = Frame(color=frame.color, velocity=velocity, depth=frame.depth)
+    coverage = {}
+    for offset in (0.5, 1.0):
+        blur = Notes2025Blur(mirror_filter="none", post_filter=False, spread_offset=offset)
+        alpha = blur.layers(frame)["alpha"][0, 0, 20:36, 30:45].detach()
+        coverage[offset] = float(alpha.mean())
+    # The bar of 10 px covers (8 - d) / 16 at a distance d < 8 px: 32 / 16 px a row.
+    expected = 2.0 / 15
+    assert abs(coverage[0.5] - expected) < 0.35 * abs(coverage[1.0] - expected)
+
+
 @pytest.mark.parametrize("given", [{}, ONE, ONE | {"separate_sums": False}])
 def test_weights_and_alphas_lie_between_zero_and_one(given):
     for frame in (random_frame(), moving_square()):

@@ -39,6 +39,7 @@ CASES = [
     ONE | {"shutter_position": "trailing"},
     HALF,
     HALF | ONE,
+    HALF | {"tile_size": 4, "early_out": 1.2, "shutter": 0.4},
     HALF | ONE | {"separate_sums": False, "tile_size": 9},
     HALF | GAPS | {"post_alpha": "output", "alpha_fade": False},
     HALF | {"shutter": 0.15, "fade_start": 0.5, "fade_end": 3.0, "fade_min_alpha": 0.2},

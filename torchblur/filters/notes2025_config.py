@@ -65,7 +65,7 @@ class Notes2025Config(FilterConfig):
     )] = "static_zero"
     spread_offset: Annotated[float, Param(
         unit="taps", low=0.0, high=4.0, grad="smooth", source="Jimenez 2014",
-        meaning="how far beyond its end a blur still counts",
+        meaning="how far beyond its end a blur still counts; 1/2 is a tap's own share of the line",
     )] = 1.0
     spread_slope: Annotated[float, Param(
         unit="1/tap", low=0.05, high=20.0, scale="log", grad="smooth", source="Jimenez 2014",
