@@ -29,7 +29,7 @@ class FrameConfig(PipelineConfig):
     """A `PipelineConfig` that says which blur, too."""
 
     blur: Preset | None = None
-    """The blur; a text alone is its name or the path of a preset."""
+    """The blur; a text alone is its name or the path of a preset. Needed if "blur" is a step."""
 
     @field_validator("blur", mode="before")
     @classmethod
@@ -51,8 +51,8 @@ def create_pipeline(
         A Module: ``pipeline(frame) -> (B, 3, H, W)``.
 
     Raises:
-        ConfigError: unknown key, step, filter or parameter, value out of range, or a blur that
-            is named and not a step, or the other way round.
+        ConfigError: unknown key, step, filter or parameter, value out of range, or a step "blur"
+            without a blur.
         FileFormatError: no such file.
     """
     place, folder = "", Path()
@@ -68,6 +68,6 @@ def create_pipeline(
             if Path(name).suffix:
                 name = folder / name
             blur = create_filter(name, engine=engine, **config.blur.params)
-        return FramePipeline(config, blur)
+        return FramePipeline(config, blur if "blur" in config.steps else None)
     except ConfigError as error:
         raise ConfigError(f"{error} ({place})" if place else str(error)) from error

@@ -171,8 +171,8 @@ def test_pipeline_from_a_file_a_mapping_and_a_config(tmp_path):
     expected = bloom(get_filter("line")(num_samples=5)(frame), intensity=0.5)
     for source in (path, str(path), data, FrameConfig.model_validate(data)):
         assert torch.equal(create_pipeline(source)(frame), expected)
-    without = create_pipeline({"steps": ["fxaa"]})
-    assert torch.equal(without(frame), fxaa(frame.color))
+    for data in ({"steps": ["fxaa"]}, {"steps": ["fxaa"], "blur": "line"}):
+        assert torch.equal(create_pipeline(data)(frame), fxaa(frame.color))
 
 
 @pytest.mark.parametrize(
@@ -182,7 +182,7 @@ def test_pipeline_from_a_file_a_mapping_and_a_config(tmp_path):
         ("steps: [fxaa, fxaa]\n", r"`steps`: must name .* at most once, got \['fxaa', 'fxaa'\]"),
         ("steps: []\n", r"`steps`: must name at least one step"),
         ("steps: [blur, fxaa]\n", r"`steps` are blur, fxaa, and no blur is given \(.*f\.yaml"),
-        ("steps: [fxaa]\nblur: line\n", r"`steps` are fxaa, and a LineBlur is given"),
+        ("steps: [fxaa]\nblur: lines\n", r"unknown filter `lines`.*f\.yaml"),
         ("blur: lines\n", r"unknown filter `lines` \(did you mean `line`"),
         ("blur: {filter: line, params: {shuter: 1}}\n", r"`shuter` \(did you mean `shutter`"),
         ("bloom: {intensty: 1}\n", r"unknown key `intensty` \(did you mean `intensity`.*bloom"),
@@ -204,6 +204,8 @@ def test_bad_calls():
         whole(frame, blom={"intensity": 0.1})
     with pytest.raises(ConfigError, match=r"`intensity` must lie in \[0, 1\], got 7"):
         whole(frame, bloom={"intensity": 7.0})
+    with pytest.raises(ConfigError, match=r"`steps` are fxaa, and a Darken is given"):
+        pipeline(["fxaa"], Darken())
     flat = Frame(color=frame.color, velocity=frame.velocity)
     with pytest.raises(FrameError, match="`depth` is needed and is missing"):
         whole(flat)
