@@ -47,7 +47,6 @@ _BOUNDS = ("ceiling", "noise")
 _CLAIM_COLUMNS = (
     "claim",
     "verdict",
-    "scene",
     "FLIP\noff, on",
     "better\nby",
     "PSNR\noff, on",
@@ -253,14 +252,13 @@ def _plain_short(value: Any) -> str:
 
 def print_ablation(config: AblationConfig, rows: Sequence[Measured]) -> None:
     """Print the claims, each with its figures at moving borders and whether it shows."""
-    table = plain_table(config.title, _CLAIM_COLUMNS, right=_CLAIM_COLUMNS[3:])
+    table = plain_table(config.title, _CLAIM_COLUMNS, right=_CLAIM_COLUMNS[2:])
     for row in rows:
         off, on = row.scores["off"], row.scores["on"]
         share, ratio = row.gain("flip_band"), row.time_ratio
         table.add_row(
-            Text(row.row.name),
+            Text.assemble(row.row.name, (f"\n  {row.case.name}", "dim")),
             Text(row.verdict, style=_TONES[row.verdict]),
-            Text(row.case.name),
             f"{_figure('flip', off)}\n{_figure('flip', on)}",
             "–" if share is None else f"{share:+.1%}",
             f"{_figure('psnr', off)}\n{_figure('psnr', on)}",

@@ -92,8 +92,9 @@ class TestRun:
             return original(*args, **kwargs)
 
         monkeypatch.setattr(tuning.data, "render_reference", counted)
-        run_ablation(load_ablation_config(table, ["time_runs=0"]))
+        first, second = run_ablation(load_ablation_config(table, ["time_runs=0"]))
         assert len(calls) == 1
+        assert first.case is second.case
 
     def test_row_has_its_own_shutter(self, table):
         config = load_ablation_config(table, ["rows.1.shutter=0.1", "time_runs=0"])
