@@ -253,6 +253,7 @@ def _plain_short(value: Any) -> str:
 def print_ablation(config: AblationConfig, rows: Sequence[Measured]) -> None:
     """Print the claims, each with its figures at moving borders and whether it shows."""
     table = plain_table(config.title, _CLAIM_COLUMNS, right=_CLAIM_COLUMNS[2:])
+    table.columns[1].min_width = len("does not")
     for row in rows:
         off, on = row.scores["off"], row.scores["on"]
         share, ratio = row.gain("flip_band"), row.time_ratio
