@@ -3,6 +3,7 @@
 ::
 
     python -m tuning.bench [--size 1280x720] [--samples 35] [--runs 3] [--json FILE]
+                           [--filters guertin2014 line] [--only speed memory notes]
 
 Figures are medians, each measurement in a process of its own. CPU-seconds are what to compare:
 on a machine that is not idle, wall time and multi-threaded CPU time are both inflated, and the
@@ -32,6 +33,9 @@ _KNOWN = {
 }
 """CPU-seconds per frame of other Guertin programs at 1280x720, N = 35, on two quiet cores."""
 
+_NOTES_US = {("full", "two"): 490, ("full", "one"): 355, ("half", "two"): 225, ("half", "one"): 195}
+"""Microseconds of the 2025 notes' own table."""
+
 
 def main() -> None:
     """Run the benchmarks and print their tables."""
@@ -39,6 +43,8 @@ def main() -> None:
     parser.add_argument("--size", default="1280x720", help="WIDTHxHEIGHT in px")
     parser.add_argument("--samples", type=int, default=35, help="taps N")
     parser.add_argument("--runs", type=int, default=3, help="timed runs of each")
+    parser.add_argument("--filters", nargs="*", help="time these; all if left out")
+    parser.add_argument("--only", nargs="*", choices=("speed", "memory", "notes"))
     parser.add_argument("--json", type=Path, help="write the figures here too")
     parser.add_argument("--child", help=argparse.SUPPRESS)
     arguments = parser.parse_args()
@@ -48,10 +54,13 @@ def main() -> None:
     width, height = (int(n) for n in arguments.size.split("x"))
     job = {"width": width, "height": height, "runs": arguments.runs}
     _warn_if_busy()
-    figures = {
-        "speed": _speed(job | {"num_samples": arguments.samples}),
-        "memory": _memory(job, arguments.samples),
+    tables: dict[str, Any] = {
+        "speed": lambda: _speed(job | {"num_samples": arguments.samples}, arguments.filters),
+        "memory": lambda: _memory(job, arguments.samples),
+        "notes": lambda: _notes(job),
     }
+    chosen = arguments.only or tuple(tables)
+    figures = {name: table() for name, table in tables.items() if name in chosen}
     if arguments.json:
         arguments.json.write_text(json.dumps(figures, indent=2))
 
@@ -62,7 +71,7 @@ def _warn_if_busy() -> None:
         print(f"warning: the machine is busy (load {load:.1f}); figures are inflated\n")
 
 
-def _speed(job: dict[str, Any]) -> list[dict[str, Any]]:
+def _speed(job: dict[str, Any], names: list[str] | None) -> list[dict[str, Any]]:
     """Time each filter eagerly and compiled, forward and with its backward pass."""
     print(
         f"forward and backward, {job['width']}x{job['height']}, N = {job['num_samples']}, "
@@ -73,7 +82,7 @@ def _speed(job: dict[str, Any]) -> list[dict[str, Any]]:
         f"{'fwd+bwd CPU s':>15}{'wall s':>8}{'first call s':>14}{'eager / it':>12}"
     )
     rows: list[dict[str, Any]] = []
-    for name in ("line", "mcguire2012", "guertin2014"):
+    for name in names or _filter_names():
         for engine in ("eager", "compiled"):
             row = _child(job | {"filter": name, "engine": engine, "what": "speed"})
             rows.append(row | {"filter": name, "engine": engine})
@@ -108,6 +117,31 @@ def _memory(job: dict[str, Any], num_samples: int) -> list[dict[str, Any]]:
     return rows
 
 
+def _notes(job: dict[str, Any]) -> list[dict[str, Any]]:
+    """Time the four variants of the 2025 notes, beside the ratios of the text's own table."""
+    print(f"\nnotes2025 with the text's taps, eager, {job['width']}x{job['height']}")
+    rows: list[dict[str, Any]] = []
+    for (resolution, directions), text in _NOTES_US.items():
+        params = {"resolution": resolution, "directions": directions}
+        row = _child(
+            job | {"filter": "notes2025", "engine": "eager", "what": "forward", "params": params}
+        )
+        rows.append(row | params)
+        print(
+            f"  {resolution} resolution, {directions}: {row['cpu']:>6.2f} CPU s, "
+            f"{row['cpu'] / rows[0]['cpu']:.2f} of the first (the text: "
+            f"{text / next(iter(_NOTES_US.values())):.2f})"
+        )
+    return rows
+
+
+def _filter_names() -> list[str]:
+    """Return the registered filters, from a process that loads torch in this one's place."""
+    code = "from torchblur.filters import registered_filters; print(*registered_filters())"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    return done.stdout.split()
+
+
 def _child(job: dict[str, Any]) -> dict[str, Any]:
     command = [sys.executable, "-m", "tuning.bench", "--child", json.dumps(job)]
     done = subprocess.run(command, capture_output=True, text=True, check=True)
@@ -129,7 +163,8 @@ def _measure(job: dict[str, Any]) -> dict[str, Any]:
         velocity=torch.nn.functional.interpolate(coarse, size, mode="bilinear"),
         depth=torch.rand(1, 1, *size, generator=generator) + 1,
     )
-    blur = get_filter(job["filter"])(engine=job["engine"], num_samples=job["num_samples"])
+    params = job.get("params") or {"num_samples": job["num_samples"]}
+    blur = get_filter(job["filter"])(None, engine=job["engine"], **params)
 
     def forward() -> None:
         with torch.no_grad():
@@ -147,6 +182,8 @@ def _measure(job: dict[str, Any]) -> dict[str, Any]:
     forward()
     first = time.perf_counter() - start
     cpu, wall = _median(forward, job["runs"])
+    if job["what"] == "forward":
+        return {"first": first, "cpu": cpu, "wall": wall}
     backward()
     backward_cpu, backward_wall = _median(backward, job["runs"])
     return {
