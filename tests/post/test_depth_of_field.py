@@ -172,7 +172,7 @@ def test_agrees_with_its_twin(params):
         color[0].numpy(),
         layers["circle"][0, 0].detach().numpy(),
         max_radius=config.max_radius,
-        edge=float(effect.edge),
+        edge=float(effect.edge.detach()),
         near_coverage=float(effect.near_coverage),
     )
     assert torch.allclose(layers["color"][0], torch.from_numpy(expected), atol=1e-6)

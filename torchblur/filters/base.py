@@ -7,16 +7,15 @@ function of a frame and the parameters' values, and a `BlurFilter` that holds th
 
 from __future__ import annotations
 
-from types import SimpleNamespace
 from typing import Annotated, Any, ClassVar
 
-import torch
-from torch import Tensor, nn
+from torch import Tensor
 
+from torchblur.configured import ConfiguredModule, Values, batch_size_of
 from torchblur.errors import ConfigError, nearest_name
 from torchblur.frame import Frame, Shutter, ShutterPosition
 from torchblur.ops.gather import Engine
-from torchblur.params import Config, Param, build, declared
+from torchblur.params import Config, Param
 
 __all__ = ["BlurFilter", "FilterConfig", "Values", "get_filter", "registered_filters"]
 
@@ -48,11 +47,7 @@ class FilterConfig(Config):
     ] = "centered"
 
 
-class Values(SimpleNamespace):
-    """Values of a filter's parameters: tensors that broadcast to (B, 1, H, W), or choices."""
-
-
-class BlurFilter(nn.Module):
+class BlurFilter(ConfiguredModule):
     """A motion-blur filter as a Module: `blur(frame) -> (B, 3, H, W)`.
 
     Smooth parameters are `nn.Parameter`s, weak ones are buffers; both are 0-d tensors named as
@@ -69,8 +64,8 @@ class BlurFilter(nn.Module):
         ConfigError: unknown name, or a value out of range.
     """
 
-    name: ClassVar[str]
     config_class: ClassVar[type[FilterConfig]]
+    config: FilterConfig
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
         super().__init_subclass__(**kwargs)
@@ -80,81 +75,13 @@ class BlurFilter(nn.Module):
     def __init__(
         self, config: FilterConfig | None = None, *, engine: Engine = "eager", **params: Any
     ) -> None:
-        super().__init__()
-        start = {} if config is None else config.model_dump()
-        self.config = build(self.config_class, start | params, place=self.name)
+        super().__init__(config, **params)
         self.engine: Engine = engine
-        for key, spec in declared(self.config_class).items():
-            value = getattr(self.config, key)
-            if spec.grad == "smooth":
-                self.register_parameter(key, nn.Parameter(torch.tensor(float(value))))
-            elif spec.grad == "weak":
-                self.register_buffer(key, torch.tensor(float(value)))
 
     @property
     def shutter_setting(self) -> Shutter:
         """The shutter as the config has it."""
         return Shutter(self.config.shutter, self.config.shutter_position)
-
-    def current_config(self) -> FilterConfig:
-        """Return the config with the present values of the parameters, after a fit say.
-
-        Raises:
-            ConfigError: if a parameter has left its range; `project_` brings it back.
-        """
-        now = {
-            key: float(getattr(self, key).detach())
-            for key, spec in declared(self.config_class).items()
-            if spec.grad != "discrete"
-        }
-        return build(self.config_class, self.config.model_dump() | now, place=self.name)
-
-    @torch.no_grad()
-    def project_(self) -> BlurFilter:
-        """Move each number back into its range, in place; for use after an optimizer's step."""
-        for key, spec in declared(self.config_class).items():
-            if spec.grad != "discrete":
-                getattr(self, key).clamp_(*spec.bounds)
-        return self
-
-    def values(self, frame: Frame, overrides: dict[str, Any] | None = None) -> Values:
-        """Return the values for one call, in the frame's type and on its device.
-
-        Args:
-            frame: The frame that will be filtered.
-            overrides: Numbers, tensors that broadcast to (B, 1, H, W), or choices, by name.
-
-        Raises:
-            ConfigError: unknown name, value out of range, or a tensor that does not broadcast.
-        """
-        specs = declared(self.config_class)
-        values = {key: getattr(self, key, None) for key in specs}
-        values |= {k: getattr(self.config, k) for k, s in specs.items() if s.grad == "discrete"}
-        for key, value in (overrides or {}).items():
-            values[key] = self._override(key, value, frame)
-        for key, value in values.items():
-            if isinstance(value, Tensor):
-                values[key] = value.to(device=frame.device, dtype=frame.dtype)
-        return Values(**values)
-
-    def _override(self, key: str, value: Any, frame: Frame) -> Any:
-        specs = declared(self.config_class)
-        if key not in specs:
-            raise ConfigError(f"unknown parameter `{key}`{nearest_name(key, specs)} ({self.name})")
-        if specs[key].grad == "discrete":
-            return getattr(build(self.config_class, {key: value}, place=self.name), key)
-        value = torch.as_tensor(value)
-        specs[key].check(key, value)
-        try:
-            shape = torch.broadcast_shapes(value.shape, (frame.batch_size, 1, *frame.size))
-        except RuntimeError:
-            shape = ()
-        if len(shape) != 4 or shape[1] != 1:
-            raise ConfigError(
-                f"`{key}` must broadcast to (B, 1, H, W) = "
-                f"{(frame.batch_size, 1, *frame.size)}, got shape {tuple(value.shape)}"
-            )
-        return value
 
     def layers(self, frame: Frame, **overrides: Any) -> dict[str, Tensor]:
         """Return everything the filter computes, by name; "color" is the result.
@@ -166,9 +93,8 @@ class BlurFilter(nn.Module):
         Returns:
             "color" (B, 3, H, W), and what the filter adds: its class says what.
         """
-        values = self.values(frame, overrides)
-        sizes = {v.shape[0] for v in vars(values).values() if isinstance(v, Tensor) and v.ndim == 4}
-        batch_size = max(sizes | {frame.batch_size})
+        values = self.values_for(frame.color, overrides)
+        batch_size = batch_size_of(values, frame.batch_size)
         if batch_size != frame.batch_size:
             frame = frame.expand(batch_size)
         return self.compute(frame, values)
@@ -185,12 +111,6 @@ class BlurFilter(nn.Module):
             **overrides: Values of parameters for this call.
         """
         return self.layers(frame, **overrides)["color"]
-
-    def extra_repr(self) -> str:
-        """Show the parameters that differ from the defaults, so that `repr` evaluates back."""
-        default = self.config_class()
-        changed = {k: v for k, v in self.config.model_dump().items() if v != getattr(default, k)}
-        return ", ".join(f"{key}={value!r}" for key, value in changed.items())
 
 
 def registered_filters() -> dict[str, type[BlurFilter]]:
