@@ -13,6 +13,7 @@ from torchblur.errors import ConfigError, FileFormatError, FrameError, OutputErr
 from torchblur.filters import BlurFilter, get_filter, registered_filters
 from torchblur.frame import Frame, Shutter
 from torchblur.io import read_frame, read_image, write_frame, write_image
+from torchblur.pipelines import create_pipeline
 from torchblur.presets import Preset, create_filter, load_preset, save_preset
 
 __version__ = "0.1.0"
@@ -28,6 +29,7 @@ __all__ = [
     "Shutter",
     "TorchblurError",
     "create_filter",
+    "create_pipeline",
     "get_filter",
     "load_preset",
     "read_frame",
