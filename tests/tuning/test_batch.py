@@ -380,7 +380,9 @@ class TestCommand:
 
 class TestStopping:
     SLOW = """
-import sys, time
+import signal, sys, time
+# A shell starts its background jobs with SIGINT ignored, and so these tests when it runs them.
+signal.signal(signal.SIGINT, signal.default_int_handler)
 import tuning.batch
 original = tuning.batch.blur_frame
 def slow(*args):
