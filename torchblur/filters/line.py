@@ -59,6 +59,9 @@ def line(frame: Frame, config: LineConfig | None = None, **params: Any) -> Tenso
     ``out(p) = 1/n Σ_i C(p − s_i v(p))``, the s_i in the middles of n equal parts of the time the
     shutter is open.
 
+    Where only depth and the camera's matrices are known, `ops.velocity.velocity_from_depth` gives
+    the velocity of a still world.
+
     Args:
         frame: Color and velocity, (B, ·, H, W).
         config: Parameters; the defaults if left out.
