@@ -11,7 +11,7 @@
 
 from torchblur.errors import ConfigError, FileFormatError, FrameError, OutputError, TorchblurError
 from torchblur.filters import BlurFilter, get_filter, registered_filters
-from torchblur.frame import Frame, Shutter
+from torchblur.frame import Frame, Sequence, Shutter
 from torchblur.io import read_frame, read_image, write_frame, write_image
 from torchblur.pipelines import create_pipeline
 from torchblur.presets import Preset, create_filter, load_preset, save_preset
@@ -26,6 +26,7 @@ __all__ = [
     "FrameError",
     "OutputError",
     "Preset",
+    "Sequence",
     "Shutter",
     "TorchblurError",
     "create_filter",

@@ -22,7 +22,8 @@ from __future__ import annotations
 import dataclasses
 import math
 import warnings
-from collections.abc import Callable, Sequence
+from collections import abc
+from collections.abc import Callable, Iterator
 from dataclasses import InitVar, dataclass
 from typing import Literal
 
@@ -31,7 +32,7 @@ from torch import Tensor
 
 from torchblur.errors import FrameError
 
-__all__ = ["FAR_DEPTH", "Frame", "Shutter", "ShutterPosition"]
+__all__ = ["FAR_DEPTH", "Frame", "Sequence", "Shutter", "ShutterPosition"]
 
 ShutterPosition = Literal["centered", "leading", "trailing"]
 
@@ -46,9 +47,10 @@ _CHANNELS = {
     "object_id": 1,
     "time": 1,
     "acceleration": 2,
+    "albedo": 3,
     "valid": 1,
 }
-_FINITE = ("color", "velocity", "normal", "time", "acceleration")
+_FINITE = ("color", "velocity", "normal", "time", "acceleration", "albedo")
 
 
 @dataclass(frozen=True)
@@ -107,6 +109,7 @@ class Frame:
         object_id: Integer object numbers, (B, 1, H, W).
         time: Time of each pixel's sample over the shutter, 0 opening, 1 closing, (B, 1, H, W).
         acceleration: Change of velocity, px/frame², (B, 2, H, W).
+        albedo: Color of the surfaces without their light, (B, 3, H, W).
         revealed: A second frame: what lies behind the moving objects.
         valid: Pixels that can be trusted, bool, (B, 1, H, W).
         source: Where the data came from (a file name); it is named in errors.
@@ -125,6 +128,7 @@ class Frame:
     object_id: Tensor | None = None
     time: Tensor | None = None
     acceleration: Tensor | None = None
+    albedo: Tensor | None = None
     revealed: Frame | None = None
     valid: Tensor | None = None
     source: str = ""
@@ -253,7 +257,7 @@ class Frame:
         return self.map(lambda t: t.expand(batch_size, -1, -1, -1))
 
     @staticmethod
-    def stack(frames: Sequence[Frame]) -> Frame:
+    def stack(frames: abc.Sequence[Frame]) -> Frame:
         """Join frames of one size into a batch; layers that not all of them have are left out.
 
         Raises:
@@ -350,6 +354,54 @@ class Frame:
         warnings.warn(f"{text}; replaced by {filler:g} and masked", stacklevel=5)
         self._set(name, torch.where(bad, torch.full_like(layer, filler), layer))
         return pixels
+
+
+@dataclass(frozen=True, eq=False)
+class Sequence:
+    """Consecutive frames of one size, and where a new shot begins.
+
+    Args:
+        frames: One frame per time step, at least one; each may be a batch of B (B sequences that
+            are filtered side by side).
+        cuts: Positions of frames that begin a new shot, in [0, number of frames); what a filter
+            remembers of the frames before is forgotten there. The first frame needs no mark.
+
+    Raises:
+        FrameError: no frame, mixed sizes or batches, or a cut outside the sequence.
+    """
+
+    frames: tuple[Frame, ...]
+    cuts: tuple[int, ...] = ()
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "frames", tuple(self.frames))
+        object.__setattr__(self, "cuts", tuple(sorted(set(self.cuts))))
+        if not self.frames:
+            raise FrameError("a sequence needs at least one frame, got none")
+        first = self.frames[0]
+        for index, frame in enumerate(self.frames):
+            if (frame.size, frame.batch_size) != (first.size, first.batch_size):
+                raise FrameError(
+                    f"the frames of a sequence must have one size and batch, "
+                    f"{first.batch_size} of {first.size} as in frame 0, got {frame.batch_size} of "
+                    f"{frame.size} in frame {index}{frame._place()}"
+                )
+        bad = [cut for cut in self.cuts if not 0 <= cut < len(self.frames)]
+        if bad:
+            raise FrameError(f"`cuts` must lie in [0, {len(self.frames) - 1}], got {bad[0]}")
+
+    def __len__(self) -> int:
+        return len(self.frames)
+
+    def __iter__(self) -> Iterator[Frame]:
+        return iter(self.frames)
+
+    def __getitem__(self, index: int) -> Frame:
+        return self.frames[index]
+
+    def map(self, function: Callable[[Frame], Frame]) -> Sequence:
+        """Return the sequence with a function applied to each frame (a crop, a move)."""
+        return Sequence(tuple(function(frame) for frame in self.frames), self.cuts)
 
 
 def _batch_and_size(layer: Tensor) -> tuple[int, int, int]:

@@ -6,10 +6,25 @@ Every module of this package is imported here, so that a new file registers its 
 from importlib import import_module
 from pkgutil import iter_modules
 
-from torchblur.filters.base import BlurFilter, FilterConfig, get_filter, registered_filters
+from torchblur.filters.base import (
+    BlurFilter,
+    FilterConfig,
+    History,
+    TemporalBlur,
+    get_filter,
+    registered_filters,
+)
 from torchblur.filters.two_pass import TwoPassBlur
 
 for _module in iter_modules(__path__):
     import_module(f"{__name__}.{_module.name}")
 
-__all__ = ["BlurFilter", "FilterConfig", "TwoPassBlur", "get_filter", "registered_filters"]
+__all__ = [
+    "BlurFilter",
+    "FilterConfig",
+    "History",
+    "TemporalBlur",
+    "TwoPassBlur",
+    "get_filter",
+    "registered_filters",
+]

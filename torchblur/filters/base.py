@@ -7,17 +7,27 @@ function of a frame and the parameters' values, and a `BlurFilter` that holds th
 
 from __future__ import annotations
 
+from collections import abc
+from dataclasses import dataclass
 from typing import Annotated, Any, ClassVar
 
 from torch import Tensor
 
 from torchblur.configured import ConfiguredModule, Values, batch_size_of
 from torchblur.errors import ConfigError, nearest_name
-from torchblur.frame import Frame, Shutter, ShutterPosition
+from torchblur.frame import Frame, Sequence, Shutter, ShutterPosition
 from torchblur.ops.gather import Engine
 from torchblur.params import Config, Param
 
-__all__ = ["BlurFilter", "FilterConfig", "Values", "get_filter", "registered_filters"]
+__all__ = [
+    "BlurFilter",
+    "FilterConfig",
+    "History",
+    "TemporalBlur",
+    "Values",
+    "get_filter",
+    "registered_filters",
+]
 
 _REGISTRY: dict[str, type[BlurFilter]] = {}
 
@@ -66,6 +76,8 @@ class BlurFilter(ConfiguredModule):
 
     config_class: ClassVar[type[FilterConfig]]
     config: FilterConfig
+    needs: ClassVar[tuple[str, ...]] = ()
+    """Layers without which the filter cannot run, beside color and velocity."""
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
         super().__init_subclass__(**kwargs)
@@ -111,6 +123,107 @@ class BlurFilter(ConfiguredModule):
             **overrides: Values of parameters for this call.
         """
         return self.layers(frame, **overrides)["color"]
+
+
+@dataclass(frozen=True, eq=False)
+class History:
+    """What a filter keeps of the frames before: planes by name, (B, C, H, W) each."""
+
+    planes: abc.Mapping[str, Tensor]
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Height and width in px."""
+        plane = next(iter(self.planes.values()))
+        return plane.shape[2], plane.shape[3]
+
+    @property
+    def batch_size(self) -> int:
+        """Number of sequences side by side."""
+        return next(iter(self.planes.values())).shape[0]
+
+    def detach(self) -> History:
+        """Return the same planes, cut off from the graph: gradients stop here."""
+        return History({name: plane.detach() for name, plane in self.planes.items()})
+
+
+class TemporalBlur(BlurFilter):
+    """A filter with a memory: ``color, history = blur(frame, history)``.
+
+    The state is explicit: nothing is kept in the Module, so that one Module serves many
+    sequences, and gradients go through time as far as the caller keeps the graph.
+    """
+
+    def step(
+        self, frame: Frame | abc.Sequence[Frame], history: History | None = None, **overrides: Any
+    ) -> tuple[dict[str, Tensor], History]:
+        """Return everything the filter computes for one frame, and what the next one needs.
+
+        Args:
+            frame: The frame; or several of the same pixels, n samples per pixel.
+            history: What the call for the frame before returned; None at the start of a shot. One
+                of another size or batch is forgotten too.
+            **overrides: Values of parameters for this call.
+        """
+        samples = (frame,) if isinstance(frame, Frame) else tuple(frame)
+        values = self.values_for(samples[0].color, overrides)
+        batch_size = batch_size_of(values, samples[0].batch_size)
+        samples = tuple(s if s.batch_size == batch_size else s.expand(batch_size) for s in samples)
+        if history is not None and (
+            history.size != samples[0].size or history.batch_size != batch_size
+        ):
+            history = None
+        return self.advance(samples, history, values)
+
+    def advance(
+        self, samples: tuple[Frame, ...], history: History | None, values: Values
+    ) -> tuple[dict[str, Tensor], History]:
+        """Call the filter's function; each filter says how."""
+        raise NotImplementedError  # pragma: no cover
+
+    def compute(self, frame: Frame, values: Values) -> dict[str, Tensor]:
+        """Return the layers of a frame that has no past."""
+        return self.advance((frame,), None, values)[0]
+
+    def layers(
+        self, frame: Frame | abc.Sequence[Frame], history: History | None = None, **overrides: Any
+    ) -> dict[str, Tensor]:
+        """Return the first part of `step`: the layers, "color" among them."""
+        return self.step(frame, history, **overrides)[0]
+
+    def forward(  # type: ignore[override]
+        self, frame: Frame | abc.Sequence[Frame], history: History | None = None, **overrides: Any
+    ) -> tuple[Tensor, History]:
+        """Return the blurred color, (B, 3, H, W), and the history; see `step`."""
+        layers, history = self.step(frame, history, **overrides)
+        return layers["color"], history
+
+    def sequence(
+        self, sequence: Sequence, *, detach_every: int | None = None, **overrides: Any
+    ) -> list[Tensor]:
+        """Return the blurred color of each frame, (B, 3, H, W) each; memory ends at cuts.
+
+        Args:
+            sequence: The frames in their order.
+            detach_every: Let gradients go back through at most so many frames (truncated): the
+                history is cut off from the graph after every k-th frame. None: all of them.
+            **overrides: Values of parameters for this call.
+
+        Raises:
+            ConfigError: if `detach_every` is below 1.
+        """
+        if detach_every is not None and detach_every < 1:
+            raise ConfigError(f"`detach_every` must be at least 1 frame, got {detach_every}")
+        history: History | None = None
+        colors = []
+        for index, frame in enumerate(sequence):
+            if index in sequence.cuts:
+                history = None
+            color, history = self(frame, history, **overrides)
+            if detach_every is not None and (index + 1) % detach_every == 0:
+                history = history.detach()
+            colors.append(color)
+        return colors
 
 
 def registered_filters() -> dict[str, type[BlurFilter]]:
