@@ -110,9 +110,30 @@ def test_optional_layers_travel_together():
     assert frame.to(dtype=torch.float64).require("object_id").dtype == torch.int64
 
 
-@pytest.mark.parametrize("open_time", [-0.1, 2.5])
+@pytest.mark.parametrize("open_time", [-0.1, 8.5, float("nan")])
 def test_shutter_range(open_time):
-    with pytest.raises(FrameError, match=rf"`open` must lie in \[0, 2\] frames, got {open_time}"):
+    with pytest.raises(FrameError, match=rf"`open` must lie in \[0, 8\] frames, got {open_time}"):
         Shutter(open_time)
     with pytest.raises(FrameError, match=r"`position` must be .*got 'middle'"):
         Shutter(0.5, "middle")
+
+
+def test_shutter_from_exposure():
+    assert Shutter.from_exposure(1 / 60, 300, "trailing") == Shutter(5.0, "trailing")
+    assert Shutter.from_exposure(1 / 48, 24) == Shutter(0.5)
+    assert Shutter.from_exposure(0, 24).interval == (0, 0)
+
+
+@pytest.mark.parametrize(
+    ("exposure", "rate", "message"),
+    [
+        (-0.1, 24, r"`exposure` must be at least 0 seconds, got -0.1"),
+        (float("inf"), 24, r"`exposure` must be at least 0 seconds, got inf"),
+        (0.1, 0, r"`frame_rate` must be above 0 frames per second, got 0"),
+        (0.1, float("nan"), r"`frame_rate` must be above 0.*got nan"),
+        (0.1, 100, r"at most 8 frames, got 10: 0.1 s at 100 frames per second"),
+    ],
+)
+def test_bad_exposure_is_refused(exposure, rate, message):
+    with pytest.raises(FrameError, match=message):
+        Shutter.from_exposure(exposure, rate)

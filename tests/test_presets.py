@@ -44,7 +44,7 @@ def test_round_trip(tmp_path):
             r"unknown filter `guertin` \(did you mean `guertin2014`.*p\.yaml: fi",
         ),
         ("filter: line\nparams: {shuter: 1}\n", r"`shuter` \(did you mean `shutter`.*p\.yaml: par"),
-        ("filter: line\nparams: {shutter: 9}\n", r"`shutter` must lie in \[0, 2\] frame, got 9"),
+        ("filter: line\nparams: {shutter: 9}\n", r"`shutter` must lie in \[0, 8\] frame, got 9"),
         ("filtr: line\n", r"unknown key `filtr` \(did you mean `filter`"),
         ("params: {}\n", r"`filter` is required"),
     ],

@@ -7,7 +7,7 @@ depth                   (B, 1, H, W) positive distance along the view axis, larg
                         the background is a large finite value or +inf
 velocity                (B, 2, H, W) screen displacement in **pixels per frame, forward in time,
                         x right, y down**; the full displacement, not half of it
-shutter                 open time as a fraction of a frame, and its position. Half spread of a
+shutter                 open time in frames (0.5 is 180 degrees), and its position. Half spread of a
                         centered shutter: ``V = shutter * velocity / 2``
 pixel centers           pixel (x, y) has its center at (x + 1/2, y + 1/2): `align_corners=False`
 borders                 replicate
@@ -32,12 +32,19 @@ from torch import Tensor
 
 from torchblur.errors import FrameError
 
-__all__ = ["FAR_DEPTH", "Frame", "Sequence", "Shutter", "ShutterPosition"]
+__all__ = ["FAR_DEPTH", "LONGEST_SHUTTER", "Frame", "Sequence", "Shutter", "ShutterPosition"]
 
 ShutterPosition = Literal["centered", "leading", "trailing"]
 
 FAR_DEPTH = 1e10
 """Depth that stands for the background in arithmetic, scene units; +inf is replaced by it."""
+
+LONGEST_SHUTTER = 8.0
+"""Longest open time of a shutter, in frames.
+
+Above 1 it is no film camera but a game: 1/60 s at 100 to 300 frames a second (Tan 2022, section 4)
+are 1.7 to 5 frames.
+"""
 
 _CHANNELS = {
     "color": 3,
@@ -58,20 +65,21 @@ class Shutter:
     """When the shutter is open, relative to the frame's own time 0.
 
     Args:
-        open: Open time as a fraction of a frame, in [0, 2]; 0.5 is a 180 degree shutter.
+        open: Open time in frames, in [0, `LONGEST_SHUTTER`] = [0, 8]; 0.5 is a 180 degree
+            shutter.
         position: "centered": open in [-open/2, open/2]. "leading": opens at the frame,
             [0, open]. "trailing": closes at the frame, [-open, 0].
 
     Raises:
-        FrameError: if `open` is outside [0, 2] or the position has another name.
+        FrameError: if `open` is outside [0, 8] or the position has another name.
     """
 
     open: float = 0.5
     position: ShutterPosition = "centered"
 
     def __post_init__(self) -> None:
-        if not 0 <= self.open <= 2:
-            raise FrameError(f"`open` must lie in [0, 2] frames, got {self.open}")
+        if not 0 <= self.open <= LONGEST_SHUTTER:
+            raise FrameError(f"`open` must lie in [0, {LONGEST_SHUTTER:g}] frames, got {self.open}")
         if self.position not in ("centered", "leading", "trailing"):
             raise FrameError(
                 f"`position` must be 'centered', 'leading' or 'trailing', got {self.position!r}"
@@ -81,6 +89,36 @@ class Shutter:
     def from_angle(cls, degrees: float, position: ShutterPosition = "centered") -> Shutter:
         """Make a shutter from its angle: 180 degrees are half a frame."""
         return cls(degrees / 360, position)
+
+    @classmethod
+    def from_exposure(
+        cls, exposure: float, frame_rate: float, position: ShutterPosition = "centered"
+    ) -> Shutter:
+        """Make a shutter from the exposure time: ``open = exposure * frame_rate``.
+
+        Args:
+            exposure: Open time in seconds, at least 0; 1/60 at 24 frames a second are 0.4 frames,
+                at 300 they are 5.
+            frame_rate: Frames per second, above 0.
+            position: As in the class.
+
+        Raises:
+            FrameError: if either is out of range, or the shutter is open for more than 8 frames.
+
+        Reference: Tan 2022, section 3.1: the vector between two frames times frame rate and
+            exposure time. There it ends at the frame: `position` "trailing".
+        """
+        if not (math.isfinite(exposure) and exposure >= 0):
+            raise FrameError(f"`exposure` must be at least 0 seconds, got {exposure}")
+        if not (math.isfinite(frame_rate) and frame_rate > 0):
+            raise FrameError(f"`frame_rate` must be above 0 frames per second, got {frame_rate}")
+        frames = exposure * frame_rate
+        if frames > LONGEST_SHUTTER:
+            raise FrameError(
+                f"a shutter is open for at most {LONGEST_SHUTTER:g} frames, got {frames:g}: "
+                f"{exposure:g} s at {frame_rate:g} frames per second"
+            )
+        return cls(frames, position)
 
     @property
     def interval(self) -> tuple[float, float]:

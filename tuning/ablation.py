@@ -18,7 +18,7 @@ from torch import Tensor
 
 from torchblur.errors import ConfigError
 from torchblur.filters import BlurFilter, get_filter
-from torchblur.frame import ShutterPosition
+from torchblur.frame import LONGEST_SHUTTER, ShutterPosition
 from torchblur.io import load_yaml
 from torchblur.params import Config, build
 from tuning.config import DataItem, DataSpec, ExrData, SceneData
@@ -72,7 +72,7 @@ class AblationRow(Config):
     size: str | None = Field(None, description="WIDTHxHEIGHT in px; the table's if left out")
     spp: int | None = Field(None, description="samples per pixel of the reference; the table's")
     color_spp: int | None = Field(None, description="of the sharp color; the table's")
-    shutter: float | None = Field(None, description="open time, fraction of a frame; the table's")
+    shutter: float | None = Field(None, description="open time in frames; the table's")
     shutter_position: ShutterPosition | None = Field(None, description="the table's if left out")
     seed: int | None = Field(None, description="seed of the renderer; the table's if left out")
 
@@ -88,8 +88,8 @@ class AblationConfig(Config):
     size: str = Field("240x136", description="WIDTHxHEIGHT in px")
     spp: int = Field(64, ge=2, description="samples per pixel of the references")
     color_spp: int = Field(16, ge=1, description="samples per pixel of the sharp colors")
-    shutter: Annotated[float, Field(ge=0, le=2)] = Field(
-        0.5, description="open time as a fraction of a frame"
+    shutter: Annotated[float, Field(ge=0, le=LONGEST_SHUTTER)] = Field(
+        0.5, description="open time in frames"
     )
     shutter_position: ShutterPosition = "centered"
     seed: int = Field(0, ge=0, description="seed of the renderer")

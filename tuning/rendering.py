@@ -12,7 +12,7 @@ from typing import Any
 from pydantic import Field
 
 from torchblur.errors import ConfigError, OutputError, nearest_name
-from torchblur.frame import Shutter, ShutterPosition
+from torchblur.frame import LONGEST_SHUTTER, Shutter, ShutterPosition
 from torchblur.io import write_frame, write_image
 from torchblur.params import Config, build
 from torchblur.render import Scene, load_scene, render_frame, render_reference
@@ -32,7 +32,7 @@ class RenderSettings(Config):
     frames: int = Field(1, ge=1, description="number of frames, from time 0 on")
     spp: int = Field(256, ge=2, description="samples per pixel of the reference")
     color_spp: int = Field(16, ge=1, description="samples per pixel of the sharp color")
-    shutter: float = Field(0.5, ge=0, le=2, description="open time as a fraction of a frame")
+    shutter: float = Field(0.5, ge=0, le=LONGEST_SHUTTER, description="open time in frames")
     shutter_position: ShutterPosition = "centered"
     seed: int = Field(0, ge=0, description="of frame 0; each frame has the next")
 

@@ -49,6 +49,18 @@ def test_moving_edge_is_a_ramp(make_scene, glow, position, start, end):
     assert (error.abs() <= 5 * reference.variance[0, 1].sqrt() + 1e-6).all()
 
 
+@pytest.mark.parametrize(
+    ("position", "start", "end"),
+    [("centered", -5.0, 5.0), ("leading", 0.0, 10.0), ("trailing", -10.0, 0.0)],
+)
+def test_exposure_of_several_frames_is_a_long_ramp(make_scene, glow, position, start, end):
+    """1/60 s at 300 frames a second: five frames of 2 px each."""
+    scene = make_scene(bar(glow, 2.0), sky={"kind": "solid", "color": [0, 0, 0]})
+    shutter = Shutter.from_exposure(1 / 60, 300, position)
+    reference = render_reference(scene, SIZE, spp=256, shutter=shutter, seed=3)
+    assert (reference.mean[0, 1] - ramp(start, end)).abs().max() < 0.02
+
+
 def test_time_passes_with_the_frame(make_scene, glow):
     scene = make_scene(bar(glow, 4.0), sky={"kind": "solid", "color": [0, 0, 0]})
     reference = render_reference(scene, SIZE, spp=256, shutter=Shutter(1.0), frame=2.0)

@@ -320,7 +320,7 @@ class TestConfig:
             ({"output_": "x"}, r"unknown key `output_` \(did you mean `output`\?\).*batch\.yaml"),
             ({"filter": "lime"}, r"unknown filter `lime` \(did you mean `line`\?\).*batch\.yaml"),
             ({"params": {"num_sample": 3}}, r"did you mean `num_samples`.*batch\.yaml"),
-            ({"params": {"shutter": 3}}, r"`shutter` must lie in \[0, 2\] frame, got 3"),
+            ({"params": {"shutter": 9}}, r"`shutter` must lie in \[0, 8\] frame, got 9"),
             ({"workers": 0}, r"`workers`.*got 0"),
             ({"inputs": []}, r"`inputs`"),
             ({"overrides": {"velocity_scal": 1}}, r"did you mean `velocity_scale`"),

@@ -228,7 +228,7 @@ class TestOthers:
         assert "did you mean `camera`?" in result.stderr
 
     @pytest.mark.parametrize(
-        ("option", "value"), [("--spp", 1), ("--frames", 0), ("--shutter", 3), ("--seed", -1)]
+        ("option", "value"), [("--spp", 1), ("--frames", 0), ("--shutter", 9), ("--seed", -1)]
     )
     def test_render_out_of_range(self, option, value, tmp_path, repository):
         scene = sorted((repository / "configs/scenes").glob("*.yaml"))[0]

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from torchblur.configured import ConfiguredModule, Values, batch_size_of
 from torchblur.errors import ConfigError, nearest_name
-from torchblur.frame import Frame, Sequence, Shutter, ShutterPosition
+from torchblur.frame import LONGEST_SHUTTER, Frame, Sequence, Shutter, ShutterPosition
 from torchblur.ops.gather import Engine
 from torchblur.params import Config, Param
 
@@ -41,10 +41,10 @@ class FilterConfig(Config):
             symbol="E",
             unit="frame",
             low=0.0,
-            high=2.0,
+            high=LONGEST_SHUTTER,
             grad="weak",
             source="180 degree shutter = 0.5",
-            meaning="open time of the shutter as a fraction of a frame; the strength of the blur",
+            meaning="open time of the shutter in frames; the strength of the blur",
         ),
     ] = 0.5
     shutter_position: Annotated[

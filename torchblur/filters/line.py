@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from torchblur.filters.base import BlurFilter, FilterConfig, Values
-from torchblur.frame import Frame, Shutter
+from torchblur.frame import LONGEST_SHUTTER, Frame, Shutter
 from torchblur.ops.gather import Engine, Inputs, Lookup, gather, lookup, pixel_grid
 from torchblur.params import Param
 
@@ -24,10 +24,10 @@ class LineConfig(FilterConfig):
             symbol="E",
             unit="frame",
             low=0.0,
-            high=2.0,
+            high=LONGEST_SHUTTER,
             grad="smooth",
             source="180 degree shutter = 0.5",
-            meaning="open time of the shutter as a fraction of a frame; the length of the line",
+            meaning="open time of the shutter in frames; the length of the line",
         ),
     ] = 0.5
     num_samples: Annotated[

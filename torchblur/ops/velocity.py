@@ -70,7 +70,7 @@ def half_velocity(
 
     Args:
         velocity: Displacement in px/frame, (B, 2, H, W).
-        shutter: Open time as a fraction of a frame, in [0, 2].
+        shutter: Open time in frames, in [0, 8].
         longest: Clamp to this length, px; None leaves the vectors as they are.
 
     Returns:

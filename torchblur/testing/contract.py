@@ -376,8 +376,8 @@ class FilterContract:
             self.filter_class(shutter="long")
         with pytest.raises(ConfigError, match=r"`shutter` must broadcast.*\(5,\)"):
             self.filter_class()(moving_square(), shutter=torch.full((5,), 0.5))
-        with pytest.raises(ConfigError, match=r"`shutter` must lie in \[0, 2\] frame, got 3"):
-            self.filter_class()(moving_square(), shutter=torch.tensor([0.5, 3]).view(2, 1, 1, 1))
+        with pytest.raises(ConfigError, match=r"`shutter` must lie in \[0, 8\] frame, got 9"):
+            self.filter_class()(moving_square(), shutter=torch.tensor([0.5, 9]).view(2, 1, 1, 1))
 
     def test_not_a_number_in_the_velocity(self) -> None:
         frame = random_frame()
