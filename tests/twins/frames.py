@@ -25,3 +25,20 @@ def uniform(rng, velocity):
     color = rng.uniform(0, 1, (3, 8, 24))
     field = np.broadcast_to(np.reshape(velocity, (2, 1, 1)), (2, 8, 24)).astype(float)
     return color, np.full((1, 8, 24), 5.0), field
+
+
+def still_stream(rng, rows=9, columns=12):
+    """A frame with times: random colors at depth 2, nothing moves."""
+    return {
+        "color": rng.uniform(0, 1, (3, rows, columns)),
+        "depth": np.full((1, rows, columns), 2.0),
+        "velocity": np.zeros((2, rows, columns)),
+        "time": np.full((1, rows, columns), 0.5),
+    }
+
+
+def moved_stream(rng, velocity, rows=9, columns=12):
+    """The same, all of it moving."""
+    frame = still_stream(rng, rows, columns)
+    frame["velocity"][:] = np.reshape(velocity, (2, 1, 1))
+    return frame
