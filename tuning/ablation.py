@@ -21,8 +21,9 @@ from torchblur.filters import BlurFilter, get_filter
 from torchblur.frame import LONGEST_SHUTTER, ShutterPosition
 from torchblur.io import load_yaml
 from torchblur.params import Config, build
-from tuning.config import DataItem, DataSpec, ExrData, SceneData
-from tuning.data import Case, load_cases
+from tuning.cases import Case
+from tuning.data import load_cases
+from tuning.data_config import DataItem, DataSpec, ExrData, SceneData
 from tuning.evaluation import Variant, noise_scores, render, score_image
 from tuning.overrides import apply_overrides
 from tuning.progress import Progress, Stage
@@ -257,7 +258,7 @@ def _seconds(sides: Mapping[str, Variant], case: Case, runs: int) -> dict[str, f
 
 
 def _load(item: DataItem, place: str) -> Case:
-    cases = load_cases(DataSpec(train=(item,)))
+    cases = [case for case in load_cases(DataSpec(train=(item,))) if isinstance(case, Case)]
     if len(cases) != 1:
         raise ConfigError(
             f"a row takes one frame, got {len(cases)}; give `frames: [N]` ({place}.exr)"

@@ -12,29 +12,23 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from pydantic import Field, create_model, field_validator
-from pydantic_core import PydanticCustomError
 
 from torchblur.errors import ConfigError, nearest_name
 from torchblur.filters import get_filter, registered_filters
-from torchblur.frame import Shutter, ShutterPosition
 from torchblur.io import load_yaml
 from torchblur.ops.gather import Engine
 from torchblur.params import Config, build, choices, declared
 from torchblur.presets import load_preset
+from tuning.data_config import DataSpec
 from tuning.overrides import apply_overrides
 
 __all__ = [
     "BlackBoxMethod",
-    "Crops",
-    "DataItem",
-    "DataSpec",
-    "ExrData",
     "FilterSpec",
     "FreeRange",
     "GradientMethod",
     "Method",
     "ObjectiveSpec",
-    "SceneData",
     "TuneConfig",
     "apply_overrides",
     "free_names",
@@ -74,88 +68,6 @@ class FilterSpec(Config):
         if isinstance(value, dict):
             return {name: {} if item is None else item for name, item in value.items()}
         return value
-
-
-class _Exposed(Config):
-    shutter: Annotated[float, Field(ge=0, le=2)] = Field(
-        0.5, description="open time as a fraction of a frame"
-    )
-    shutter_position: ShutterPosition = Field(
-        "centered", description="open around the frame's time, after it, or before it"
-    )
-
-    @property
-    def exposure(self) -> Shutter:
-        """The shutter of the reference."""
-        return Shutter(self.shutter, self.shutter_position)
-
-
-class SceneData(_Exposed):
-    """Frames of a procedural scene, rendered by torchblur and cached."""
-
-    kind: Literal["scene"]
-    path: str = Field(description="scene file")
-    size: str = Field("320x180", description="WIDTHxHEIGHT in px")
-    frames: tuple[float, ...] = Field((0.0,), min_length=1, description="times, in frames")
-    spp: int = Field(256, ge=2, description="samples per pixel of the reference")
-    color_spp: int = Field(16, ge=1, description="samples per pixel of the sharp color")
-    seed: int = Field(0, ge=0, description="seed of the renderer")
-
-    @field_validator("size")
-    @classmethod
-    def _is_size(cls, value: str) -> str:
-        parts = value.split("x")
-        if len(parts) != 2 or not all(p.isdigit() and int(p) > 0 for p in parts):
-            raise PydanticCustomError(
-                "nested", "{text}", {"text": f"`size` must be WIDTHxHEIGHT in px, got {value!r}"}
-            )
-        return value
-
-    @property
-    def height_width(self) -> tuple[int, int]:
-        """Height and width in px."""
-        width, height = (int(part) for part in self.size.split("x"))
-        return height, width
-
-
-class ExrData(_Exposed):
-    """Frames of another renderer, as EXR files in one folder."""
-
-    kind: Literal["exr"]
-    path: str = Field(".", description="folder")
-    sharp: str = Field("sharp.exr", description="sharp render; #### stands for the frame number")
-    gbuffer: str | None = Field(
-        None, description="file with depth, velocity … if they are not in the sharp render's"
-    )
-    reference: str = Field("reference.exr", description="render with motion blur")
-    convention: str = Field("auto", description="whose channel names and signs")
-    frames: tuple[int, ...] | None = Field(
-        None, min_length=1, description="frame numbers for ####; all that are there if left out"
-    )
-
-
-DataItem = Annotated[SceneData | ExrData, Field(discriminator="kind")]
-
-
-class Crops(Config):
-    """Windows to fit on, instead of full frames; more of them where something moves."""
-
-    size: int = Field(128, ge=16, description="edge of the scored window, px")
-    per_frame: int = Field(4, ge=1, description="windows of each frame")
-    context: int | None = Field(
-        None,
-        ge=0,
-        description="px around it that are filtered and not scored; twice the tile if left out",
-    )
-
-
-class DataSpec(Config):
-    """What is fitted, and what the fit never sees. Split by scene, never by crop."""
-
-    root: str = Field(".", description="folder that the paths below are relative to")
-    train: tuple[DataItem, ...] = Field(min_length=1, description="frames to fit")
-    holdout: tuple[DataItem, ...] = Field((), description="frames for the evaluation alone")
-    crops: Crops | None = Field(None, description="fit on windows; on full frames if left out")
 
 
 Metric = Literal["flip", "flip_hdr", "l1", "mse", "relative_l2", "ssim"]

@@ -1,4 +1,4 @@
-"""What a fit evaluates: full frames, or windows of them where something moves."""
+"""What a fit evaluates: full frames and sequences, or windows where something moves."""
 
 from __future__ import annotations
 
@@ -10,11 +10,12 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from torchblur.filters import BlurFilter
 from torchblur.frame import Frame, Shutter
-from tuning.config import Crops
-from tuning.data import Case
+from tuning.cases import AnyCase, Case
+from tuning.data_config import Crops
 
-__all__ = ["Sample", "make_samples"]
+__all__ = ["AnySample", "Sample", "SequenceSample", "make_samples"]
 
 _MOVING = 0.5  # px over the open shutter; less is not seen as blur
 _CANDIDATE_STEPS = 8  # windows are placed on a grid of 1/8 of their size
@@ -38,50 +39,133 @@ class Sample:
     inner: tuple[int, int, int, int]
     shutter: Shutter
 
+    @property
+    def size(self) -> tuple[int, int]:
+        """Height and width of what is filtered, px."""
+        return self.frame.size
+
+    @property
+    def device(self) -> torch.device:
+        """Where it lies."""
+        return self.frame.device
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class SequenceSample:
+    """A window of a sequence, the same in all of its frames.
+
+    Args:
+        steps: The window with its context: for each time step one frame, a batch of 1, or several
+            of the same pixels.
+        cuts: Positions of frames that begin a new shot.
+        warm_up: So many frames at the start are not scored.
+        references: The scored part of each reference, (1, 3, h, w).
+        bands: The scored part of each band, (1, 1, h, w).
+        inner: Top, left, height and width of the scored part within the window, px.
+        shutter: The shutter of the references.
+    """
+
+    steps: tuple[tuple[Frame, ...], ...]
+    cuts: tuple[int, ...]
+    warm_up: int
+    references: tuple[Tensor, ...]
+    bands: tuple[Tensor, ...]
+    inner: tuple[int, int, int, int]
+    shutter: Shutter
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Height and width of what is filtered, px."""
+        return self.steps[0][0].size
+
+    @property
+    def device(self) -> torch.device:
+        """Where it lies."""
+        return self.steps[0][0].device
+
+
+AnySample = Sample | SequenceSample
+
 
 def make_samples(
-    cases: Sequence[Case], crops: Crops | None, *, tile_size: int, seed: int
-) -> list[Sample]:
+    cases: Sequence[AnyCase],
+    crops: Crops | None,
+    *,
+    tile_size: int,
+    seed: int,
+    blur: BlurFilter | None = None,
+) -> list[AnySample]:
     """Return what a fit evaluates: the full frames, or windows of them.
 
     Windows are drawn where something moves: the chance of a place is its number of moving pixels.
     A window is filtered with context around it, so that the filter's reach does not end at its
     edge, and only the inner part is scored. Its origin is a multiple of the tile, so that tiles
-    lie as in the full frame.
+    lie as in the full frame. A window of a sequence is the same in all of its frames.
 
     Args:
-        cases: The frames.
+        cases: The frames and sequences.
         crops: Windows, or None for full frames.
         tile_size: Tile of the filter, px.
         seed: Of the places.
+        blur: The filter that is fitted: it decides which frames of a sequence it takes, see
+            `SequenceCase.steps`.
     """
-    if crops is None:
-        return [_full(case) for case in cases]
     generator = torch.Generator().manual_seed(seed)
+    places = [[(0, 0)] if crops is None else _places(case, crops, generator) for case in cases]
     return [
-        _window(case, top, left, crops, tile_size)
-        for case in cases
-        for top, left in _places(case, crops, generator)
+        _cut_out(case, _box(case.size, top, left, crops, tile_size), blur)
+        for case, corners in zip(cases, places, strict=True)
+        for top, left in corners
     ]
 
 
-def _full(case: Case) -> Sample:
-    return Sample(
-        frame=case.frame,
-        reference=case.reference,
-        band=case.band,
-        inner=(0, 0, *case.frame.size),
+@dataclass(frozen=True)
+class _Box:
+    """A window: what is filtered, and where the scored part lies within it; (y, x, h, w), px."""
+
+    outer: tuple[int, int, int, int]
+    inner: tuple[int, int, int, int]
+
+    def scored(self, image: Tensor) -> Tensor:
+        top, left = self.outer[0] + self.inner[0], self.outer[1] + self.inner[1]
+        return image[..., top : top + self.inner[2], left : left + self.inner[3]]
+
+    def filtered(self, frame: Frame) -> Frame:
+        return frame if frame.size == self.outer[2:] else frame.crop(*self.outer)
+
+
+def _cut_out(case: AnyCase, box: _Box, blur: BlurFilter | None) -> AnySample:
+    if isinstance(case, Case):
+        return Sample(
+            frame=box.filtered(case.frame),
+            reference=box.scored(case.reference),
+            band=box.scored(case.band),
+            inner=box.inner,
+            shutter=case.shutter,
+        )
+    return SequenceSample(
+        steps=tuple(tuple(box.filtered(f) for f in step) for step in case.steps(blur)),
+        cuts=case.cuts,
+        warm_up=case.warm_up,
+        references=tuple(box.scored(reference) for reference in case.references),
+        bands=tuple(box.scored(band) for band in case.bands),
+        inner=box.inner,
         shutter=case.shutter,
     )
 
 
-def _places(case: Case, crops: Crops, generator: torch.Generator) -> list[tuple[int, int]]:
+def _moving(case: AnyCase) -> Tensor:
+    """Return how often each pixel moves, in [0, 1], (1, 1, H, W)."""
+    frames = [case.frame] if isinstance(case, Case) else list(case.sharp or case.samples[0])
+    moves = [f.velocity.norm(dim=1, keepdim=True) * case.shutter.open > _MOVING for f in frames]
+    return torch.stack([m.to(device="cpu", dtype=torch.float64) for m in moves]).mean(dim=0)
+
+
+def _places(case: AnyCase, crops: Crops, generator: torch.Generator) -> list[tuple[int, int]]:
     """Draw top left corners, without repetition, where pixels move."""
-    height, width = (min(crops.size, edge) for edge in case.frame.size)
-    length = case.frame.velocity.norm(dim=1, keepdim=True) * case.shutter.open
-    moving = (length > _MOVING).to(device="cpu", dtype=torch.float64)
+    height, width = (min(crops.size, edge) for edge in case.size)
     stride = max(1, crops.size // _CANDIDATE_STEPS)
-    share = F.avg_pool2d(moving, (height, width), stride=stride)[0, 0]
+    share = F.avg_pool2d(_moving(case), (height, width), stride=stride)[0, 0]
     if not bool((share > 0).any()):
         share = torch.ones_like(share)
     count = min(crops.per_frame, int((share > 0).sum()))
@@ -90,20 +174,16 @@ def _places(case: Case, crops: Crops, generator: torch.Generator) -> list[tuple[
     return [(int(i) // columns * stride, int(i) % columns * stride) for i in chosen]
 
 
-def _window(case: Case, top: int, left: int, crops: Crops, tile_size: int) -> Sample:
-    height, width = (min(crops.size, edge) for edge in case.frame.size)
+def _box(size: tuple[int, int], top: int, left: int, crops: Crops | None, tile_size: int) -> _Box:
+    if crops is None:
+        return _Box((0, 0, *size), (0, 0, *size))
+    height, width = (min(crops.size, edge) for edge in size)
     context = 2 * tile_size if crops.context is None else crops.context
-    rows, columns = case.frame.size
-    outer_top, outer_height = _outer(top, height, rows, context, tile_size)
-    outer_left, outer_width = _outer(left, width, columns, context, tile_size)
-    inner = (top - outer_top, left - outer_left, height, width)
-    scored = (..., slice(top, top + height), slice(left, left + width))
-    return Sample(
-        frame=case.frame.crop(outer_top, outer_left, outer_height, outer_width),
-        reference=case.reference[scored],
-        band=case.band[scored],
-        inner=inner,
-        shutter=case.shutter,
+    outer_top, outer_height = _outer(top, height, size[0], context, tile_size)
+    outer_left, outer_width = _outer(left, width, size[1], context, tile_size)
+    return _Box(
+        (outer_top, outer_left, outer_height, outer_width),
+        (top - outer_top, left - outer_left, height, width),
     )
 
 

@@ -4,7 +4,9 @@ import os
 
 import pytest
 from planted import FIXED, PLANTED, planted_case, write_planted
+from planted_sequences import Recall
 
+import torchblur.filters.base
 from torchblur.filters import get_filter
 from tuning.config import ObjectiveSpec
 from tuning.problem import Problem
@@ -31,3 +33,10 @@ def planted_problem():
 def planted_folders(tmp_path):
     """The data of a configuration that fits two planted cases on disk."""
     return write_planted(tmp_path / "frames")
+
+
+@pytest.fixture
+def recall(monkeypatch):
+    """The stand-in filter with a memory, by its name "recall"."""
+    monkeypatch.setitem(torchblur.filters.base._REGISTRY, Recall.name, Recall)
+    return Recall

@@ -12,8 +12,8 @@ import tuning.data
 from torchblur.errors import ConfigError, FileFormatError
 from torchblur.io import write_frame, write_image
 from torchblur.params import build
-from tuning.config import Crops, DataSpec
 from tuning.data import cache_folder, load_cases
+from tuning.data_config import Crops, DataSpec
 from tuning.windows import make_samples
 
 SCENE = """

@@ -1,0 +1,200 @@
+"""What a fit is told of its data: scenes to render and files to read, frames and sequences."""
+
+from __future__ import annotations
+
+import itertools
+from typing import Annotated, Any, Literal
+
+from pydantic import AfterValidator, BeforeValidator, Field, field_validator
+from pydantic_core import PydanticCustomError
+
+from torchblur.frame import LONGEST_SHUTTER, Shutter, ShutterPosition
+from torchblur.params import Config
+
+__all__ = [
+    "Crops",
+    "DataItem",
+    "DataSpec",
+    "ExrData",
+    "ExrStreamData",
+    "SceneData",
+    "SceneStreamData",
+]
+
+
+class _Exposed(Config):
+    shutter: Annotated[float, Field(ge=0, le=LONGEST_SHUTTER)] = Field(
+        0.5, description="open time in frames"
+    )
+    shutter_position: ShutterPosition = Field(
+        "centered", description="open around the frame's time, after it, or before it"
+    )
+
+    @property
+    def exposure(self) -> Shutter:
+        """The shutter of the reference."""
+        return Shutter(self.shutter, self.shutter_position)
+
+
+class _Sized(Config):
+    size: str = Field("320x180", description="WIDTHxHEIGHT in px")
+
+    @field_validator("size")
+    @classmethod
+    def _is_size(cls, value: str) -> str:
+        parts = value.split("x")
+        if len(parts) != 2 or not all(p.isdigit() and int(p) > 0 for p in parts):
+            raise _refusal(f"`size` must be WIDTHxHEIGHT in px, got {value!r}")
+        return value
+
+    @property
+    def height_width(self) -> tuple[int, int]:
+        """Height and width in px."""
+        width, height = (int(part) for part in self.size.split("x"))
+        return height, width
+
+
+class SceneData(_Sized, _Exposed):
+    """Frames of a procedural scene, rendered by torchblur and cached."""
+
+    kind: Literal["scene"]
+    path: str = Field(description="scene file")
+    frames: tuple[float, ...] = Field((0.0,), min_length=1, description="times, in frames")
+    spp: int = Field(256, ge=2, description="samples per pixel of the reference")
+    color_spp: int = Field(16, ge=1, description="samples per pixel of the sharp color")
+    seed: int = Field(0, ge=0, description="seed of the renderer")
+
+
+class ExrData(_Exposed):
+    """Frames of another renderer, as EXR files in one folder."""
+
+    kind: Literal["exr"]
+    path: str = Field(".", description="folder")
+    sharp: str = Field("sharp.exr", description="sharp render; #### stands for the frame number")
+    gbuffer: str | None = Field(
+        None, description="file with depth, velocity … if they are not in the sharp render's"
+    )
+    reference: str = Field("reference.exr", description="render with motion blur")
+    convention: str = Field("auto", description="whose channel names and signs")
+    frames: tuple[int, ...] | None = Field(
+        None, min_length=1, description="frame numbers for ####; all that are there if left out"
+    )
+
+
+def _numbers(value: Any) -> Any:
+    """Turn {start, stop} into the frame numbers from `start` up to `stop`, which is left out."""
+    if not isinstance(value, dict):
+        return value
+    if set(value) != {"start", "stop"} or not all(type(v) is int for v in value.values()):
+        raise _refusal(f"`frames` must be a list or {{start: 0, stop: 8}}, got {value}")
+    if value["stop"] <= value["start"]:
+        raise _refusal(f"`start < stop` must hold, got {value['start']} and {value['stop']}")
+    return tuple(range(value["start"], value["stop"]))
+
+
+def _rising(value: tuple[int, ...]) -> tuple[int, ...]:
+    for before, after in itertools.pairwise(value):
+        if after <= before:
+            raise _refusal(f"the frames of a sequence must rise, got {before} before {after}")
+    return value
+
+
+def _refusal(text: str) -> PydanticCustomError:
+    return PydanticCustomError("nested", "{text}", {"text": text})
+
+
+_Numbers = Annotated[
+    tuple[int, ...], Field(min_length=1), BeforeValidator(_numbers), AfterValidator(_rising)
+]
+
+
+class _Stream(_Exposed):
+    """A sequence in its order; a new shot begins at cuts and where numbers are left out."""
+
+    shutter: Annotated[float, Field(ge=0, le=LONGEST_SHUTTER)] = Field(
+        1.0, description="open time in frames, over which the samples' times lie"
+    )
+    cuts: tuple[int, ...] = Field((), description="numbers of frames that begin a new shot")
+    warm_up: int = Field(
+        0, ge=0, description="frames at the start that are filtered and not scored"
+    )
+
+
+class SceneStreamData(_Sized, _Stream):
+    """A sequence of a procedural scene: each sample at its own random time, and references."""
+
+    kind: Literal["scene_stream"]
+    path: str = Field(description="scene file")
+    frames: _Numbers = Field(
+        tuple(range(8)), description="frame numbers: a list, or {start: 0, stop: 8} for 0 to 7"
+    )
+    spp: int = Field(256, ge=2, description="samples per pixel of the references")
+    stream_spp: int = Field(1, ge=1, description="samples per pixel of the stream")
+    color_spp: int = Field(16, ge=1, description="samples per pixel of the sharp color")
+    pixel: Literal["center", "box"] = Field(
+        "center",
+        description="what references average over: the time at the pixel's center, to which the "
+        "stream converges, or the pixel's area too",
+    )
+    seed: int = Field(0, ge=0, description="seed of the renderer")
+
+
+class ExrStreamData(_Stream):
+    """A sequence of another renderer: samples with their times and references, as EXR files."""
+
+    kind: Literal["exr_stream"]
+    path: str = Field(".", description="folder")
+    stream: tuple[str, ...] = Field(
+        ("stream.####.exr",),
+        min_length=1,
+        description="samples with their layers, time too; several patterns are several samples "
+        "per pixel",
+    )
+    reference: str = Field("reference.####.exr", description="render with motion blur")
+    center: str | None = Field(
+        None, description="sharp frames with their layers, for filters that want no times"
+    )
+    convention: str = Field("auto", description="whose channel names and signs")
+    frames: _Numbers | None = Field(
+        None, description="numbers for ####: a list, or {start: 1, stop: 9}; all if left out"
+    )
+
+    @field_validator("stream", mode="before")
+    @classmethod
+    def _one_or_several(cls, value: object) -> object:
+        return (value,) if isinstance(value, str) else value
+
+    @field_validator("stream", "reference", "center")
+    @classmethod
+    def _is_numbered(cls, value: object) -> object:
+        names = value if isinstance(value, tuple) else (value,)
+        for name in names:
+            if isinstance(name, str) and "#" not in name:
+                raise _refusal(f"a sequence needs #### for the frame number, got {name!r}")
+        return value
+
+
+DataItem = Annotated[
+    SceneData | ExrData | SceneStreamData | ExrStreamData, Field(discriminator="kind")
+]
+
+
+class Crops(Config):
+    """Windows to fit on, instead of full frames; more of them where something moves."""
+
+    size: int = Field(128, ge=16, description="edge of the scored window, px")
+    per_frame: int = Field(4, ge=1, description="windows of each frame, or of each sequence")
+    context: int | None = Field(
+        None,
+        ge=0,
+        description="px around it that are filtered and not scored; twice the tile if left out",
+    )
+
+
+class DataSpec(Config):
+    """What is fitted, and what the fit never sees. Split by scene, never by crop."""
+
+    root: str = Field(".", description="folder that the paths below are relative to")
+    train: tuple[DataItem, ...] = Field(min_length=1, description="frames to fit")
+    holdout: tuple[DataItem, ...] = Field((), description="frames for the evaluation alone")
+    crops: Crops | None = Field(None, description="fit on windows; on full frames if left out")

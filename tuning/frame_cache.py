@@ -1,0 +1,120 @@
+"""Rendered frames on disk: made once, found again by everything that they depend on."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import warnings
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+import torchblur.render
+from torchblur.frame import Frame
+from torchblur.render import load_scene
+
+__all__ = ["cache_folder", "cache_key", "cached", "frame_of", "hash_scene", "planes_of"]
+
+
+def cache_folder() -> Path:
+    """Return where rendered frames are kept.
+
+    TORCHBLUR_CACHE, or `torchblur` in XDG_CACHE_HOME, or `~/.cache/torchblur`.
+    """
+    if own := os.environ.get("TORCHBLUR_CACHE"):
+        return Path(own)
+    base = os.environ.get("XDG_CACHE_HOME")
+    return (Path(base) if base else Path.home() / ".cache") / "torchblur"
+
+
+def cached(key: str, make: Callable[[], dict[str, Tensor]]) -> dict[str, Tensor]:
+    """Return tensors from the cache, or make them and keep them there.
+
+    Args:
+        key: What `cache_key` returned.
+        make: Makes them.
+    """
+    path = cache_folder() / "frames" / f"{key}.pt"
+    if path.is_file():
+        try:
+            stored: dict[str, Tensor] = torch.load(path, weights_only=True)
+            return stored
+        except Exception as error:
+            warnings.warn(f"{path} cannot be read ({error}); rendering again", stacklevel=2)
+    tensors = {name: tensor.contiguous() for name, tensor in make().items()}
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        temporary = path.with_name(f".{path.name}.{os.getpid()}.part")
+        torch.save(tensors, temporary)
+        temporary.replace(path)
+    except OSError as error:
+        warnings.warn(f"rendered frames are not kept: {error}", stacklevel=2)
+    return tensors
+
+
+def cache_key(scene_key: str, settings: Mapping[str, Any], time: float) -> str:
+    """Return a name for a frame: of its scene, its settings, and the renderer's source.
+
+    Args:
+        scene_key: What `hash_scene` returned.
+        settings: All that the renderer is told, as plain data.
+        time: The frame's time.
+    """
+    parts = [scene_key, json.dumps(settings, sort_keys=True), repr(time), _renderer_hash()]
+    return hashlib.sha256("\n".join(parts).encode()).hexdigest()[:32]
+
+
+def hash_scene(path: Path) -> str:
+    """Return the hash of a scene file and of the files that it names."""
+    scene = load_scene(path)
+    digest = hashlib.sha256(scene.model_dump_json().encode())
+    for text in _strings(scene.model_dump()):
+        file = path.parent / text
+        if len(text) < os.pathconf("/", "PC_NAME_MAX") and file.is_file():
+            digest.update(file.read_bytes())
+    return digest.hexdigest()[:32]
+
+
+def planes_of(frame: Frame, prefix: str) -> dict[str, Tensor]:
+    """Return the layers of a frame under names that begin with a prefix, to be kept."""
+    return {f"{prefix}.{name}": layer for name, layer in frame.layers().items()}
+
+
+def frame_of(tensors: Mapping[str, Tensor], prefix: str, source: str) -> Frame:
+    """Return the frame whose layers `planes_of` named.
+
+    Args:
+        tensors: What `cached` returned.
+        prefix: As it was given to `planes_of`.
+        source: Name of the frame for messages.
+    """
+    layers: dict[str, Any] = {
+        name.removeprefix(f"{prefix}."): tensor
+        for name, tensor in tensors.items()
+        if name.startswith(f"{prefix}.")
+    }
+    return Frame(**layers, source=source)
+
+
+def _strings(value: Any) -> Iterator[str]:
+    if isinstance(value, str):
+        yield value
+    elif isinstance(value, dict):
+        for item in value.values():
+            yield from _strings(item)
+    elif isinstance(value, (list, tuple)):
+        for item in value:
+            yield from _strings(item)
+
+
+def _renderer_hash() -> str:
+    """Return the hash of the renderer's source: another renderer, another image."""
+    digest = hashlib.sha256()
+    for folder in torchblur.render.__path__:
+        for file in sorted(Path(folder).glob("*.py")):
+            digest.update(file.read_bytes())
+    return digest.hexdigest()
