@@ -1,4 +1,4 @@
-"""How far an image is from its reference: FLIP, PSNR, SSIM, and where to measure them.
+"""How far images are from their references: FLIP, PSNR, SSIM, over time, and where to measure.
 
 All metrics take `(image, reference)` in this order, in batches, and are differentiable.
 """
@@ -17,6 +17,7 @@ from torchblur.metrics.images import display_encode
 from torchblur.metrics.masks import border_band, masked_mean
 from torchblur.metrics.psnr import psnr
 from torchblur.metrics.ssim import ssim
+from torchblur.metrics.temporal import flip_change_error, temporal_error, temporal_errors
 
 __all__ = [
     "DEFAULT_PPD",
@@ -25,6 +26,7 @@ __all__ = [
     "display_encode",
     "evaluate",
     "exposure_range",
+    "flip_change_error",
     "flip_hdr",
     "flip_ldr",
     "masked_mean",
@@ -32,4 +34,6 @@ __all__ = [
     "prepare_flip_ldr",
     "psnr",
     "ssim",
+    "temporal_error",
+    "temporal_errors",
 ]
