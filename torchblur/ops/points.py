@@ -7,6 +7,7 @@ the listed pixels, and may leave the list but not the image.
 
 from __future__ import annotations
 
+from collections import abc
 from typing import NamedTuple
 
 import torch
@@ -14,13 +15,23 @@ from torch import Tensor
 
 from torchblur.ops.gather import Inputs
 
-__all__ = ["Points", "flat", "nearest_index", "per_point", "points_where", "put", "take", "unflat"]
+__all__ = [
+    "Points",
+    "flat",
+    "nearest_index",
+    "per_point",
+    "points_where",
+    "put",
+    "take",
+    "total",
+    "unflat",
+]
 
 
 class Points(NamedTuple):
     """Some pixels of a batch of images."""
 
-    index: Tensor
+    place: Tensor
     """Positions in the flat planes, integers, (N,)."""
     x: Tensor
     """Columns, px, in the planes' type, (1, N)."""
@@ -32,9 +43,9 @@ class Points(NamedTuple):
     """Batch, height and width of the images."""
 
     @property
-    def count(self) -> int:
+    def number(self) -> int:
         """Number of pixels, N."""
-        return self.index.shape[0]
+        return self.place.shape[0]
 
     def inputs(self) -> Inputs:
         """Return what the taps of a gather need to look up near these pixels."""
@@ -45,7 +56,7 @@ class Points(NamedTuple):
         """Return those of the pixels where a mask (1, N) is true."""
         keep = chosen[0]
         return Points(
-            self.index[keep], self.x[:, keep], self.y[:, keep], self.first[:, keep], self.shape
+            self.place[keep], self.x[:, keep], self.y[:, keep], self.first[:, keep], self.shape
         )
 
 
@@ -86,7 +97,7 @@ def take(planes: Tensor, points: Points) -> Tensor:
 
     Differentiable: in the planes.
     """
-    return flat(planes).index_select(1, points.index)
+    return flat(planes).index_select(1, points.place)
 
 
 def put(values: Tensor, points: Points, rest: Tensor | None = None) -> Tensor:
@@ -107,7 +118,7 @@ def put(values: Tensor, points: Points, rest: Tensor | None = None) -> Tensor:
         base = values.new_zeros(values.shape[0], batch * height * width)
     else:
         base = flat(rest)
-    return unflat(base.index_copy(1, points.index, values), points.shape)
+    return unflat(base.index_copy(1, points.place, values), points.shape)
 
 
 def per_point(value: Tensor | float, points: Points, like: Tensor) -> Tensor:
@@ -143,3 +154,15 @@ def nearest_index(x: Tensor, y: Tensor, inputs: Inputs) -> tuple[Tensor, Tensor,
     y = torch.minimum(y.round().clamp(min=0), size[1] - 1)
     index = inputs["first"] + y.long() * size[0].long() + x.long()
     return index[0], x, y
+
+
+def total(parts: abc.Sequence[tuple[Tensor, ...]]) -> tuple[Tensor, ...]:
+    """Return the sums of several gathers over the same pixels, accumulator by accumulator.
+
+    Args:
+        parts: What each gather returned.
+    """
+    sums = parts[0]
+    for part in parts[1:]:
+        sums = tuple(a + b for a, b in zip(sums, part, strict=True))
+    return sums
