@@ -1,28 +1,39 @@
-"""Sharp G-buffers and motion-blurred references of a scene.
+"""Sharp G-buffers, stochastic streams and motion-blurred references of a scene.
 
-Both come from the same rays. The G-buffer is computed in float64 and eagerly; its motion vectors
-are the derivative of where a surface point appears, through the transforms of body and camera.
+All come from the same rays. The layers of G-buffer and stream are computed in float64; their
+motion vectors are the derivative of where a surface point appears, through the transforms of body
+and camera.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Literal, get_args
 
 import torch
 from torch import Tensor
 
 from torchblur.errors import ConfigError
 from torchblur.frame import Frame, Shutter
-from torchblur.render.camera import project
 from torchblur.render.compiling import Engine, check_engine
-from torchblur.render.motion import into, place
 from torchblur.render.scene import Scene
-from torchblur.render.trace import CHUNK, Hit, Tracer
-from torchblur.render.vectors import Vec
+from torchblur.render.stream import StreamTracer, random_planes
+from torchblur.render.surface import pixel_centers, surface_layers
+from torchblur.render.trace import CHUNK, Tracer
 
-__all__ = ["Reference", "Renderer", "render_frame", "render_reference"]
+__all__ = [
+    "PixelFilter",
+    "Reference",
+    "Renderer",
+    "render_frame",
+    "render_reference",
+    "render_stream",
+]
+
+PixelFilter = Literal["box", "center"]
+"""Where in a pixel its samples lie: anywhere, or all at its center."""
 
 _WORTH_COMPILING = 1e8  # rays times bodies: half a minute of eager work on one core
 _STEP_X, _STEP_Y = 0.7548776662466927, 0.5698402909980532  # R2 sequence: 1/p, 1/p², p³ = p + 1
@@ -75,10 +86,11 @@ class Renderer:
         """Return the sharp frame; see `render_frame`."""
         _check(size, color_spp, "color_spp", frame)
         tracer = Tracer(self.scene, frame, dtype=torch.float64, device=self.device)
-        x, y = _pixel_centers(size, self.device)
-        layers = _surface_layers(tracer, size, x, y)
+        x, y = pixel_centers(size, self.device)
+        now = torch.zeros_like(x)
+        layers = surface_layers(tracer, size, x, y, now, acceleration=True)
         if color_spp == 1:
-            color = tracer.image(size, x, y, torch.zeros_like(x))
+            color = tracer.image(size, x, y, now)
         else:
             color, _ = self._sampled(size, color_spp, (0.0, 0.0), frame, seed)
         images = {name: _image(layer, size) for name, layer in layers.items()}
@@ -100,12 +112,43 @@ class Renderer:
         shutter: Shutter | None = None,
         frame: float = 0.0,
         seed: int = 0,
+        pixel: PixelFilter = "box",
     ) -> Reference:
         """Return the motion-blurred reference; see `render_reference`."""
         _check(size, spp, "spp", frame)
+        if pixel not in get_args(PixelFilter):
+            raise ConfigError(f"`pixel` must be 'box' or 'center', got {pixel!r}")
         interval = (shutter or Shutter()).interval
-        mean, variance = self._sampled(size, spp, interval, frame, seed)
+        mean, variance = self._sampled(size, spp, interval, frame, seed, pixel)
         return Reference(mean=_image(mean, size), variance=_image(variance, size), spp=spp)
+
+    @torch.no_grad()
+    def stream(
+        self,
+        size: tuple[int, int],
+        *,
+        frame: float = 0.0,
+        shutter: Shutter | None = None,
+        spp: int = 1,
+        seed: int = 0,
+        jitter: bool = False,
+    ) -> list[Frame]:
+        """Return the frames of a stochastic stream; see `render_stream`."""
+        _check(size, spp, "spp", frame)
+        tracer = StreamTracer(
+            self.scene, frame, device=self.device, compiled=self._compiles(size, spp)
+        )
+        count = size[0] * size[1]
+        frames = []
+        for sample in range(spp):
+            time, *shift = random_planes(seed, frame, sample, (3 if jitter else 1, count))
+            moved = torch.stack(shift).double() - 0.5 if jitter else None
+            frames.append(tracer.frame(size, shutter or Shutter(1.0), time, moved))
+        return frames
+
+    def _compiles(self, size: tuple[int, int], spp: int) -> bool:
+        work = size[0] * size[1] * spp * self._num_bodies
+        return self.engine == "compiled" or (self.engine == "auto" and work > _WORTH_COMPILING)
 
     def _sampled(
         self,
@@ -114,18 +157,18 @@ class Renderer:
         interval: tuple[float, float],
         frame: float,
         seed: int,
+        pixel: PixelFilter = "box",
     ) -> tuple[Tensor, Tensor]:
         """Return mean and variance of the mean, (3, H*W) each."""
         height, width = size
-        work = height * width * spp * self._num_bodies
-        compiled = self.engine == "compiled" or (self.engine == "auto" and work > _WORTH_COMPILING)
+        compiled = self._compiles(size, spp)
         tracer = Tracer(self.scene, frame, device=self.device, compiled=compiled)
         generator = torch.Generator().manual_seed(seed)
         block = max(1, CHUNK // spp)
         means, variances = [], []
         for first in range(0, height * width, block):
             pixels = torch.arange(first, min(first + block, height * width))
-            samples = _samples(pixels, width, spp, interval, generator)
+            samples = _samples(pixels, width, spp, interval, generator, pixel)
             x, y, times = (plane.flatten().to(self.device) for plane in samples)
             radiance = tracer.image(size, x, y, times).view(3, spp, -1)
             means.append(radiance.mean(1))
@@ -172,6 +215,7 @@ def render_reference(
     shutter: Shutter | None = None,
     frame: float = 0.0,
     seed: int = 0,
+    pixel: PixelFilter = "box",
 ) -> Reference:
     """Render what a camera with an open shutter sees: the mean over the shutter and the pixel.
 
@@ -187,23 +231,81 @@ def render_reference(
         frame: The time, in frames; any finite number.
         seed: Same seed, same bits (on one machine with one engine); another seed gives an
             independent image.
+        pixel: "box": the mean over the pixel, without aliasing. "center": all samples at the
+            pixel's center; what a stream of `render_stream` converges to.
 
     Returns:
         Mean and variance of the mean.
 
     Raises:
-        ConfigError: a bad size, number of samples or time.
+        ConfigError: a bad size, number of samples, time or pixel filter.
 
     Differentiable: no.
 
     Reference: the references of Oberberger 2022, section 5 (4096 samples with random times). We
         differ: stratified, so that fewer samples do.
     """
-    return Renderer(scene).reference(size, spp=spp, shutter=shutter, frame=frame, seed=seed)
+    return Renderer(scene).reference(
+        size, spp=spp, shutter=shutter, frame=frame, seed=seed, pixel=pixel
+    )
+
+
+def render_stream(
+    scene: Scene,
+    size: tuple[int, int],
+    *,
+    frame: float = 0.0,
+    shutter: Shutter | None = None,
+    spp: int = 1,
+    seed: int = 0,
+    jitter: bool = False,
+) -> list[Frame]:
+    """Render a stochastic stream: every pixel as it is at a random time of its own.
+
+    The times are uniform over the shutter, and independent from pixel to pixel, frame to frame
+    and sample to sample. The mean of many streams is ``render_reference(..., pixel="center")``
+    (with `jitter`: "box") with the same shutter.
+
+    Args:
+        scene: The scene.
+        size: Height and width in px, each at least 1.
+        frame: The time of the frame, in frames; any finite number. Consecutive ones make a
+            sequence.
+        shutter: When the shutter is open around `frame`; a whole frame, centered, if left out, so
+            that the shutters of successive frames touch.
+        spp: Samples per pixel, at least 1.
+        seed: Of the times; any integer. A frame has the same times whatever was rendered before,
+            and sample k is the same whatever `spp` is.
+        jitter: Take each sample at a random position in the pixel instead of its center.
+
+    Returns:
+        `spp` frames of one, each with one sample of every pixel: `time` over the shutter (0 the
+        opening, 1 the closing), and at that time: `color`; `albedo`, the color of the texture
+        without light (of the sky and of emissive bodies: their radiance); planar `depth` (+inf
+        for the sky); `normal` (in the world, facing the camera; 0 for the sky); `object_id` (0
+        for the sky); and `velocity`, px/frame. What is seen at (x, y) at time t is at time s, to
+        first order, at ``(x, y) + shutter.open * velocity * (s - t)``.
+
+    Raises:
+        ConfigError: a bad size, number of samples or time.
+
+    Differentiable: no.
+
+    Reference: the input of Oberberger 2022, section 3. We differ: no shadows or reflections, and
+        velocity is the derivative, not the displacement over the shutter.
+    """
+    return Renderer(scene).stream(
+        size, frame=frame, shutter=shutter, spp=spp, seed=seed, jitter=jitter
+    )
 
 
 def _samples(
-    pixels: Tensor, width: int, spp: int, interval: tuple[float, float], generator: torch.Generator
+    pixels: Tensor,
+    width: int,
+    spp: int,
+    interval: tuple[float, float],
+    generator: torch.Generator,
+    pixel: PixelFilter,
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Return x, y and time of all samples of some pixels, (spp, pixels) each, float32."""
     count = pixels.shape[0]
@@ -212,6 +314,8 @@ def _samples(
     index = torch.arange(spp, dtype=torch.float64)[:, None]
     x = ((index * _STEP_X % 1).float() + shift_x) % 1
     y = ((index * _STEP_Y % 1).float() + shift_y) % 1
+    if pixel == "center":
+        x, y = torch.full_like(x, 0.5), torch.full_like(y, 0.5)
     start, end = interval
     times = start + (end - start) * (index.float() + jitter) / spp
     return x + (pixels % width), y + pixels.div(width, rounding_mode="floor"), times
@@ -229,65 +333,6 @@ def _variance_of_mean(values: Tensor) -> Tensor:
         return torch.full_like(values[:, 0], math.inf)
     steps = values - values.roll(1, 1)
     return steps.square().sum(1) / (2 * num_strata**2)
-
-
-def _surface_layers(
-    tracer: Tracer, size: tuple[int, int], x: Tensor, y: Tensor
-) -> dict[str, Tensor]:
-    now = torch.zeros_like(x)
-    origins, directions = tracer.rays(size, x, y, now)
-    hit = tracer.closest_hit(origins, directions, now)
-    velocity, acceleration = _image_motion(_path(tracer, size, origins, directions, hit), now)
-    return {
-        "depth": hit.distance,
-        "normal": hit.normal,
-        "object_id": tracer.object_ids[hit.body.long()],
-        "velocity": velocity,
-        "acceleration": acceleration,
-    }
-
-
-def _path(
-    tracer: Tracer, size: tuple[int, int], origins: Tensor, directions: Tensor, hit: Hit
-) -> Callable[[Tensor], Tensor]:
-    """Return where the points that were hit appear, as a function of time: (N,) -> (2, N)."""
-    is_sky = torch.isinf(hit.distance)
-    point = _planes(origins + directions * torch.where(is_sky, 1.0, hit.distance))
-    sky = _planes(directions)
-    levels = tracer.levels_of(hit.body)
-    glass = tracer.lens(size)
-    own, _ = into(levels, torch.zeros_like(hit.distance), point, sky)
-
-    def path(time: Tensor) -> Tensor:
-        moved = place(levels, time, own)
-        return torch.stack(project(tracer.camera_levels, glass, time, moved, sky, is_sky))
-
-    return path
-
-
-def _image_motion(path: Callable[[Tensor], Tensor], now: Tensor) -> tuple[Tensor, Tensor]:
-    """Return first and second derivative of N paths, (2, N) each.
-
-    Each path depends on its own time alone, so the gradient of a sum has them all.
-    """
-    velocity, acceleration = [], []
-    with torch.enable_grad():
-        time = now.clone().requires_grad_()
-        for coordinate in path(time).unbind(0):
-            (speed,) = torch.autograd.grad(coordinate.sum(), time, create_graph=True)
-            (change,) = torch.autograd.grad(speed.sum(), time, retain_graph=True)
-            velocity.append(speed.detach())
-            acceleration.append(change)
-    return torch.stack(velocity), torch.stack(acceleration)
-
-
-def _planes(vectors: Tensor) -> Vec:
-    return vectors[0], vectors[1], vectors[2]
-
-
-def _pixel_centers(size: tuple[int, int], device: torch.device) -> tuple[Tensor, Tensor]:
-    rows, columns = (torch.arange(n, dtype=torch.float64, device=device) + 0.5 for n in size)
-    return columns.repeat(size[0]), rows.repeat_interleave(size[1])
 
 
 def _image(layer: Tensor, size: tuple[int, int]) -> Tensor:
