@@ -92,6 +92,12 @@ class ObjectiveSpec(Config):
     band_weight: float = Field(
         0.0, ge=0, le=1, description="share of the band at moving borders; the rest is the image"
     )
+    temporal: float = Field(
+        0.0,
+        ge=0,
+        description="of sequences: weight of the error of the change from frame to frame, "
+        "|(I_t - I_t-1) - (R_t - R_t-1)| in `color_space`",
+    )
 
 
 class _MethodBase(Config):
@@ -114,6 +120,12 @@ class GradientMethod(_MethodBase):
     )
     batch: int | None = Field(
         None, ge=1, description="frames or windows of a step, drawn anew; all if left out"
+    )
+    unroll: int | None = Field(
+        None,
+        ge=1,
+        description="frames of a sequence that gradients go back through at most (truncated "
+        "backpropagation: memory for so many); all if left out",
     )
 
 

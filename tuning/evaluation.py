@@ -12,10 +12,11 @@ from torch import Tensor
 
 from torchblur.filters import BlurFilter
 from torchblur.metrics import evaluate
+from tuning.blurring import blurred
 from tuning.config import GradientMethod, ObjectiveSpec
 from tuning.data import Case
 from tuning.gradient import GradientJob, fit_gradient
-from tuning.problem import Problem, blurred
+from tuning.problem import Problem
 from tuning.progress import Stage
 from tuning.result import CaseScore
 from tuning.space import Space

@@ -169,7 +169,8 @@ class _State:
         values = self.job.space.from_unit(self.unit)
         leaves = {name: v.detach().requires_grad_(True) for name, v in values.items()}
         fixed = dict(self.job.fixed)
-        for part in problem.losses(fixed | leaves, count, self._chosen(problem)):
+        chosen, unroll = self._chosen(problem), self.job.method.unroll
+        for part in problem.losses(fixed | leaves, count, chosen, unroll=unroll):
             total += part.detach().double().cpu()
             if part.requires_grad:
                 part.sum().backward()

@@ -14,6 +14,7 @@ from torchblur.metrics import (
     prepare_flip_hdr,
     prepare_flip_ldr,
     ssim,
+    temporal_error,
 )
 from tuning.config import ObjectiveSpec
 
@@ -55,6 +56,21 @@ class PreparedObjective:
         for metric, weight in self.spec.terms.items():
             total = total + weight * masked_mean(self._map(metric, image), self._weights)
         return total
+
+    def change(self, image: Tensor, before: Tensor, previous: PreparedObjective) -> Tensor:
+        """Return the mean error of the change from the frame before, (K,), at least 0.
+
+        Args:
+            image: Scene-linear radiance of this frame, (K, 3, H, W).
+            before: The same of the frame before.
+            previous: The objective of the frame before.
+
+        Differentiable: yes.
+        """
+        map = temporal_error(
+            image, before, self._reference, previous._reference, space=self.spec.color_space
+        )
+        return masked_mean(map, self._weights)
 
     def _map(self, metric: str, image: Tensor) -> Tensor:
         if metric in self._flip:

@@ -7,18 +7,18 @@ import torch
 from planted import PLANTED, write_planted
 
 import tuning.gradient
-import tuning.problem
+import tuning.groups
 from torchblur.errors import ConfigError, OutputError
 from torchblur.io import load_yaml, read_frame, read_image
 from torchblur.metrics import psnr
 from torchblur.params import build
 from torchblur.presets import create_filter, load_preset
 from tuning.blackbox import BlackBoxJob, fit_blackbox
+from tuning.blurring import blurred
 from tuning.config import BlackBoxMethod, FilterSpec, GradientMethod, TuneConfig
 from tuning.evaluation import sensitivities
 from tuning.fit import run_fit
 from tuning.gradient import FitError, GradientJob, fit_gradient
-from tuning.problem import blurred
 from tuning.result import FitResult
 from tuning.space import make_space
 
@@ -144,7 +144,7 @@ class TestBadLosses:
                 kappa = torch.as_tensor(values["kappa"]).view(-1, 1, 1, 1)
                 return torch.where(kappa > limit, torch.nan, image)
 
-            monkeypatch.setattr(tuning.problem, "blurred", broken)
+            monkeypatch.setattr(tuning.groups, "blurred", broken)
 
         return break_it
 

@@ -9,10 +9,11 @@ from planted import FIXED, PLANTED, planted_case, tiny_frame
 
 from torchblur.filters import get_filter
 from torchblur.metrics import flip_hdr, flip_ldr, ssim
+from tuning.blurring import blurred
 from tuning.config import ObjectiveSpec
 from tuning.data_config import Crops
 from tuning.objective import prepare_objective
-from tuning.problem import Problem, blurred
+from tuning.problem import Problem
 from tuning.windows import make_samples
 
 
@@ -138,7 +139,7 @@ def test_a_set_without_a_finite_image_is_alone_with_it(monkeypatch):
         image = blurred(blur, frame, shutter, position, values, free)
         return torch.where(torch.tensor([False, True]).view(-1, 1, 1, 1), torch.nan, image)
 
-    monkeypatch.setattr("tuning.problem.blurred", broken)
+    monkeypatch.setattr("tuning.groups.blurred", broken)
     values = {"kappa": torch.tensor([10.0, 10.0], dtype=torch.float64, requires_grad=True)}
     losses = sum(problem.losses(values, 2))
     losses[0].backward()
