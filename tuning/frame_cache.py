@@ -6,7 +6,7 @@ import hashlib
 import json
 import os
 import warnings
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -70,13 +70,7 @@ def cache_key(scene_key: str, settings: Mapping[str, Any], time: float) -> str:
 
 def hash_scene(path: Path) -> str:
     """Return the hash of a scene file and of the files that it names."""
-    scene = load_scene(path)
-    digest = hashlib.sha256(scene.model_dump_json().encode())
-    for text in _strings(scene.model_dump()):
-        file = path.parent / text
-        if len(text) < os.pathconf("/", "PC_NAME_MAX") and file.is_file():
-            digest.update(file.read_bytes())
-    return digest.hexdigest()[:32]
+    return load_scene(path).fingerprint()
 
 
 def planes_of(frame: Frame, prefix: str) -> dict[str, Tensor]:
@@ -98,17 +92,6 @@ def frame_of(tensors: Mapping[str, Tensor], prefix: str, source: str) -> Frame:
         if name.startswith(f"{prefix}.")
     }
     return Frame(**layers, source=source)
-
-
-def _strings(value: Any) -> Iterator[str]:
-    if isinstance(value, str):
-        yield value
-    elif isinstance(value, dict):
-        for item in value.values():
-            yield from _strings(item)
-    elif isinstance(value, (list, tuple)):
-        for item in value:
-            yield from _strings(item)
 
 
 def _renderer_hash() -> str:

@@ -3,6 +3,7 @@
 Each kind is one class: its fields, its `shape` (up to four numbers), and two pure functions over
 rays: `interval`, the ray parameters where the ray enters and leaves (all kinds are convex), and
 `normal`, the outward normal at a point of the surface. A new kind is a new class in `Solid`.
+Triangle meshes are bodies, too; see `torchblur.render.mesh_body`.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ from torchblur.render.motion import Number, Placed
 from torchblur.render.textures import Texture
 from torchblur.render.vectors import Vec, add, dot, scale
 
-__all__ = ["Box", "Capsule", "Cylinder", "Plane", "Solid", "Sphere"]
+__all__ = ["Body", "Box", "Capsule", "Convex", "Cylinder", "Plane", "Solid", "Sphere"]
 
 Size = Annotated[Number, Field(gt=0)]
 Shape: TypeAlias = tuple[Tensor, Tensor, Tensor, Tensor]
@@ -35,10 +36,15 @@ class Body(Placed):
         description="number in the `object_id` layer; left out: that of the group, else the "
         "position in the list of the scene, counted from 1. The sky is 0",
     )
-    texture: Texture = Field(description="color over the surface, fixed to the body")
     emissive: bool = Field(
         False, description="show the texture's radiance as it is, without the light's cosine"
     )
+
+
+class Convex(Body):
+    """A body that a ray enters once, in closed form."""
+
+    texture: Texture = Field(description="color over the surface, fixed to the body")
 
     @property
     def shape(self) -> tuple[float, ...]:
@@ -56,7 +62,7 @@ class Body(Placed):
         raise NotImplementedError
 
 
-class Sphere(Body):
+class Sphere(Convex):
     """A sphere around the origin."""
 
     kind: Literal["sphere"]
@@ -69,16 +75,16 @@ class Sphere(Body):
 
     @staticmethod
     def interval(origin: Vec, direction: Vec, shape: Shape) -> tuple[Tensor, Tensor]:
-        """See `Body.interval`; by the closest approach, which keeps float32 accurate."""
+        """See `Convex.interval`; by the closest approach, which keeps float32 accurate."""
         return _ball(origin, direction, shape[0])
 
     @staticmethod
     def normal(point: Vec, shape: Shape) -> Vec:
-        """See `Body.normal`."""
+        """See `Convex.normal`."""
         return scale(point, 1 / shape[0])
 
 
-class Box(Body):
+class Box(Convex):
     """A box around the origin, its edges along the axes."""
 
     kind: Literal["box"]
@@ -91,14 +97,14 @@ class Box(Body):
 
     @staticmethod
     def interval(origin: Vec, direction: Vec, shape: Shape) -> tuple[Tensor, Tensor]:
-        """See `Body.interval`: three slabs."""
+        """See `Convex.interval`: three slabs."""
         x, y, z = (_slab(origin[i], direction[i], shape[i]) for i in range(3))
         near = torch.maximum(torch.maximum(x[0], y[0]), z[0])
         return near, torch.minimum(torch.minimum(x[1], y[1]), z[1])
 
     @staticmethod
     def normal(point: Vec, shape: Shape) -> Vec:
-        """See `Body.normal`."""
+        """See `Convex.normal`."""
         x, y, z = (point[i] / shape[i] for i in range(3))
         is_x = (x.abs() >= y.abs()) & (x.abs() >= z.abs())
         is_y = ~is_x & (y.abs() >= z.abs())
@@ -111,7 +117,7 @@ class Box(Body):
         )
 
 
-class Plane(Body):
+class Plane(Convex):
     """A rectangle in the local x-y plane, seen from both sides; without a size it is endless."""
 
     kind: Literal["plane"]
@@ -126,7 +132,7 @@ class Plane(Body):
 
     @staticmethod
     def interval(origin: Vec, direction: Vec, shape: Shape) -> tuple[Tensor, Tensor]:
-        """See `Body.interval`: entry and exit are one."""
+        """See `Convex.interval`: entry and exit are one."""
         distance = -origin[2] / _away_from_zero(direction[2])
         x, y, _ = add(origin, scale(direction, distance))
         inside = (x.abs() <= shape[0]) & (y.abs() <= shape[1])
@@ -134,12 +140,12 @@ class Plane(Body):
 
     @staticmethod
     def normal(point: Vec, shape: Shape) -> Vec:
-        """See `Body.normal`."""
+        """See `Convex.normal`."""
         zero = torch.zeros_like(point[2])
         return zero, zero, torch.ones_like(point[2])
 
 
-class Cylinder(Body):
+class Cylinder(Convex):
     """A solid cylinder with flat ends, its axis along the local y axis (a flat one is a disk)."""
 
     kind: Literal["cylinder"]
@@ -153,12 +159,12 @@ class Cylinder(Body):
 
     @staticmethod
     def interval(origin: Vec, direction: Vec, shape: Shape) -> tuple[Tensor, Tensor]:
-        """See `Body.interval`: an endless tube within a slab."""
+        """See `Convex.interval`: an endless tube within a slab."""
         return _stub(origin, direction, shape[0], shape[1])
 
     @staticmethod
     def normal(point: Vec, shape: Shape) -> Vec:
-        """See `Body.normal`."""
+        """See `Convex.normal`."""
         x, y, z = point
         radial = torch.sqrt(x * x + z * z + _TINY)
         is_end = y.abs() / shape[1] >= radial / shape[0]
@@ -170,7 +176,7 @@ class Cylinder(Body):
         )
 
 
-class Capsule(Body):
+class Capsule(Convex):
     """A cylinder with half spheres at its ends, its axis along the local y axis."""
 
     kind: Literal["capsule"]
@@ -184,7 +190,7 @@ class Capsule(Body):
 
     @staticmethod
     def interval(origin: Vec, direction: Vec, shape: Shape) -> tuple[Tensor, Tensor]:
-        """See `Body.interval`: the union of a stub and two balls, which is convex."""
+        """See `Convex.interval`: the union of a stub and two balls, which is convex."""
         x, y, z = origin
         parts = (
             _stub(origin, direction, shape[0], shape[1]),
@@ -201,14 +207,14 @@ class Capsule(Body):
 
     @staticmethod
     def normal(point: Vec, shape: Shape) -> Vec:
-        """See `Body.normal`."""
+        """See `Convex.normal`."""
         x, y, z = point
         along = torch.maximum(torch.minimum(y, shape[1]), -shape[1])
         return scale((x, y - along, z), 1 / shape[0])
 
 
 Solid = Sphere | Box | Plane | Cylinder | Capsule
-"""All kinds of bodies."""
+"""All kinds of procedural bodies."""
 
 
 def _ball(origin: Vec, direction: Vec, radius: Tensor) -> tuple[Tensor, Tensor]:

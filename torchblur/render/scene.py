@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
 import os
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import Field, model_validator
 from ruamel.yaml import YAML
@@ -15,6 +17,7 @@ from torchblur.errors import ConfigError
 from torchblur.params import Config, build
 from torchblur.render.bodies import Solid
 from torchblur.render.camera import Camera
+from torchblur.render.mesh_body import Mesh
 from torchblur.render.motion import Level, Number, Placed, Triple
 from torchblur.render.textures import SolidTexture, Texture
 
@@ -48,7 +51,7 @@ class Group(Placed):
     bodies: tuple[Body, ...] = Field(min_length=1, description="bodies and groups in it")
 
 
-Body = Annotated[Solid | Group, Field(discriminator="kind")]
+Body = Annotated[Solid | Mesh | Group, Field(discriminator="kind")]
 """A body or a group, told apart by `kind`."""
 
 
@@ -67,13 +70,26 @@ class Scene(Config):
     )
     bodies: tuple[Body, ...] = Field(min_length=1, description="bodies and groups, at least one")
 
-    def placed_bodies(self) -> list[tuple[Solid, list[Level], int]]:
+    def placed_bodies(self) -> list[tuple[Solid | Mesh, list[Level], int]]:
         """Return each body with its motions, outermost first, and its object id."""
         return [
             found
             for number, body in enumerate(self.bodies, start=1)
             for found in _unfold(body, [], number)
         ]
+
+    def fingerprint(self) -> str:
+        """Return a hash of what the scene says and what its files hold, wherever they lie.
+
+        The materials and images that a mesh file names count, too.
+        """
+        digest = hashlib.sha256()
+        for body, _, _ in self.placed_bodies():
+            for file in body.files if isinstance(body, Mesh) else []:
+                digest.update(f"{file.name}\n".encode() + file.read_bytes())
+        data = _with_paths(self.model_dump(mode="json"), lambda path: Path(path).name)
+        digest.update(json.dumps(data, sort_keys=True).encode())
+        return digest.hexdigest()[:32]
 
 
 Group.model_rebuild()
@@ -84,7 +100,7 @@ def load_scene(path: str | os.PathLike[str]) -> Scene:
     """Read a scene from a YAML file.
 
     Args:
-        path: The file; `configs/scenes/` has examples.
+        path: The file; `configs/scenes/` has examples. Paths in it start at its folder.
 
     Returns:
         The scene.
@@ -104,12 +120,23 @@ def load_scene(path: str | os.PathLike[str]) -> Scene:
             f"a scene must be a mapping with `camera` and `bodies`, got {type(data).__name__} "
             f"({os.fspath(path)})"
         )
-    return build(Scene, data, os.fspath(path))
+    folder = Path(path).absolute().parent
+    return build(Scene, _with_paths(data, lambda name: str(folder / name)), os.fspath(path))
+
+
+def _with_paths(data: Any, change: Callable[[str], str]) -> Any:
+    """Return plain data of a scene with the paths of its meshes changed."""
+    if isinstance(data, dict):
+        changed = {key: _with_paths(value, change) for key, value in data.items()}
+        if changed.get("kind") == "mesh" and isinstance(changed.get("path"), str):
+            changed["path"] = change(changed["path"])
+        return changed
+    return [_with_paths(item, change) for item in data] if isinstance(data, list) else data
 
 
 def _unfold(
-    body: Solid | Group, outer: list[Level], number: int
-) -> Iterator[tuple[Solid, list[Level], int]]:
+    body: Solid | Mesh | Group, outer: list[Level], number: int
+) -> Iterator[tuple[Solid | Mesh, list[Level], int]]:
     levels = [*outer, body.level()]
     number = body.object_id or number
     if not isinstance(body, Group):

@@ -18,7 +18,7 @@ from torchblur.params import Config
 from torchblur.render.motion import Number, Triple
 from torchblur.render.vectors import Vec, add, dot, scale, select, subtract
 
-__all__ = ["TABLE_WIDTH", "TEXTURES", "Texture"]
+__all__ = ["TABLE_WIDTH", "TEXTURES", "Carried", "Texture"]
 
 Radiance = Annotated[Number, Field(ge=0)]
 Color = tuple[Radiance, Radiance, Radiance]
@@ -235,7 +235,21 @@ Texture = Annotated[
 ]
 """All kinds of textures, told apart by `kind`."""
 
-TEXTURES = (SolidTexture, Checker, Stripes, Dots, Crosses, Brick, Noise, Spokes)
+
+class Carried:
+    """The texture of a mesh with colors of its own: its points are the colors."""
+
+    def row(self) -> list[float]:
+        """Return no numbers; see `SolidTexture.row`."""
+        return []
+
+    @staticmethod
+    def paint(point: Vec, row: list[Tensor]) -> Vec:
+        """See `SolidTexture.paint`."""
+        return point
+
+
+TEXTURES = (SolidTexture, Checker, Stripes, Dots, Crosses, Brick, Noise, Spokes, Carried)
 
 
 def _shifted(point: Vec, row: list[Tensor]) -> Vec:

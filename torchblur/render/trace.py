@@ -1,7 +1,8 @@
 """Rays against a scene: the closest hit, each ray at its own time, and the radiance it sees.
 
 One small function is run per body (`_step`) and per kind of texture (`_painter`). They are
-compiled once per kind, not per scene: sizes, motions and colors are rows of tables.
+compiled once per kind, not per scene: sizes, motions and colors are rows of tables. Meshes come
+after all other bodies, and are never compiled by torch (`_mesh_step`).
 """
 
 from __future__ import annotations
@@ -14,12 +15,14 @@ from typing import Any, NamedTuple, TypeAlias
 import torch
 from torch import Tensor
 
-from torchblur.render.bodies import Body
+from torchblur.render.bodies import Convex
 from torchblur.render.camera import camera_rays, lens
 from torchblur.render.compiling import execute
+from torchblur.render.mesh_body import Mesh
+from torchblur.render.mesh_rays import MeshRays, mesh_rays
 from torchblur.render.motion import Placed, Triple, fold, into, level_table, turn
 from torchblur.render.scene import Scene
-from torchblur.render.textures import TABLE_WIDTH, TEXTURES
+from torchblur.render.textures import TABLE_WIDTH, TEXTURES, Carried
 from torchblur.render.vectors import Vec, add, dot, normalize, scale, select, subtract
 
 __all__ = ["CHUNK", "Hit", "Tracer"]
@@ -38,9 +41,11 @@ class Hit(NamedTuple):
     Args:
         distance: Ray parameter of the hit, in lengths of the direction, +inf for the sky, (N,).
         body: Index of the body, the number of bodies for the sky, int32, (N,).
-        point: Hit in the body's own space, just below the surface, scene units; for the sky the
-            unit direction, (3, N).
-        normal: Unit normal in the world, facing the ray; 0 for the sky, (3, N).
+        point: What textures take: the hit in the body's own space, just below the surface, scene
+            units; for the sky the unit direction; for a mesh without a texture its own color
+            there; (3, N).
+        normal: Unit normal in the world, facing the ray (interpolated normals of a mesh may lean
+            away at its rim); 0 for the sky, (3, N).
     """
 
     distance: Tensor
@@ -79,10 +84,17 @@ class Tracer:
         self.object_ids = torch.tensor([number for *_, number in placed] + [0], device=device)
         self.levels = [self._table(level_table(fold(each), frame)) for _, each, _ in placed]
         self.camera_levels = self._table(level_table(fold([scene.camera.level()]), frame))
-        self._shapes = [self._table(_filled(body.shape, 4)) for body in self.bodies]
+        self._shapes = [
+            self._table(_filled(body.shape, 4)) if isinstance(body, Convex) else None
+            for body in self.bodies
+        ]
+        self._meshes = [
+            mesh_rays(body, self._device, dtype) if isinstance(body, Mesh) else None
+            for body in self.bodies
+        ]
         self._numbers = torch.arange(len(placed), dtype=torch.int32, device=device).unbind(0)
         self._light = self._table([*_unit(scene.light.direction), scene.light.ambient])
-        textures = [*(body.texture for body in self.bodies), scene.sky]
+        textures = [*(body.texture or Carried() for body in self.bodies), scene.sky]
         kinds = [TEXTURES.index(type(texture)) for texture in textures]
         # Tables have room for more, so that most scenes are alike to the compiler.
         width = -(-len(textures) // _ROOM) * _ROOM
@@ -163,16 +175,34 @@ class Tracer:
         """Return half width, half height and focal length for an image size, px, (3,)."""
         return lens(self.camera, size).to(self._device, self._dtype)
 
+    def radiance(self, hit: Hit, *, lit: bool = True) -> Tensor:
+        """Return the scene-linear radiance of hits, (3, N).
+
+        Args:
+            hit: From `closest_hit`.
+            lit: False: without the light, the textures' own colors.
+        """
+        parts = []
+        for planes, count in self._chunks(hit.body, *hit.point.unbind(0), *hit.normal.unbind(0)):
+            state = (planes[0], planes[0], planes[1:4], planes[4:7])
+            parts.append(torch.stack([p[:count] for p in self._shade(state, lit)]))  # type: ignore[arg-type]
+        return torch.cat(parts, 1)
+
     def _trace(self, origin: Vec, direction: Vec, time: Tensor) -> _State:
         state = _nothing(direction, len(self.bodies))
-        tables = zip(self.bodies, self.levels, self._shapes, self._numbers, strict=True)
+        rays = (origin, direction, time)
+        tables = list(zip(self.bodies, self.levels, self._shapes, self._numbers, strict=True))
         for body, levels, shape, number in tables:
-            step = _step(type(body))
-            rays = (origin, direction, time)
-            state = execute(step, self._compiled, state, rays, levels, shape, number)
+            if isinstance(body, Convex):
+                step = _step(type(body))
+                state = execute(step, self._compiled, state, rays, levels, shape, number)
+        for (body, levels, _, number), mesh in zip(tables, self._meshes, strict=True):
+            if mesh is not None:
+                skin = None if body.texture is None else _SKIN
+                state = _mesh_step(state, rays, levels, (mesh, skin), number)
         return state
 
-    def _shade(self, state: _State) -> Vec:
+    def _shade(self, state: _State, lit: bool = True) -> Vec:
         _, body, point, normal = state
         color = _zeros(point)
         seen = torch.bincount(self._kinds[body], minlength=len(TEXTURES)).tolist()
@@ -180,8 +210,10 @@ class Tracer:
             painter = _painter(kind)
             tables = (self._kinds, self._paint)
             color = execute(painter, self._compiled, color, point, body, *tables)
-        lit: Vec = execute(_lit, self._compiled, color, normal, body, self._emissive, self._light)
-        return lit
+        if lit:
+            tables = (self._emissive, self._light)
+            color = execute(_lit, self._compiled, color, normal, body, *tables)
+        return color
 
     def _chunks(self, *planes: Tensor) -> Iterator[tuple[tuple[Tensor, ...], int]]:
         """Cut planes of N rays into chunks; compiled code takes full ones only."""
@@ -212,7 +244,7 @@ def _zeros(like: Vec) -> Vec:
 
 
 @functools.cache
-def _step(kind: type[Body]) -> Callable[..., _State]:
+def _step(kind: type[Convex]) -> Callable[..., _State]:
     """Return the function that tries one body of a kind on all rays."""
 
     def step(
@@ -238,6 +270,33 @@ def _step(kind: type[Body]) -> Callable[..., _State]:
 
     step.__name__ = f"step_{kind.__name__.lower()}"
     return step
+
+
+def _mesh_step(
+    state: _State,
+    rays: tuple[Vec, Vec, Tensor],
+    levels: Tensor,
+    mesh: tuple[MeshRays, float | None],
+    body: Tensor,
+) -> _State:
+    """Try a mesh on all rays, as `_step` does a body."""
+    origin, direction = into(levels, rays[2], rays[0], rays[1])
+    hits = mesh[0].closest((origin, direction), state[0], _NEAR, mesh[1])
+    own = hits.normal.unbind(1)
+    normal = turn(levels, rays[2][hits.which], (own[0], own[1], own[2]))
+
+    def put(plane: Tensor, values: Tensor) -> Tensor:
+        return plane.index_put((hits.which,), values)
+
+    def put_vec(old: Vec, values: Sequence[Tensor]) -> Vec:
+        return put(old[0], values[0]), put(old[1], values[1]), put(old[2], values[2])
+
+    return (
+        put(state[0], hits.distance),
+        put(state[1], body),
+        put_vec(state[2], hits.point.unbind(1)),
+        put_vec(state[3], normal),
+    )
 
 
 @functools.cache
