@@ -75,9 +75,35 @@ def test_a_companion_read_for_itself_is_no_companion_of_itself(folder):
     assert frame.gbuffer is None
 
 
+def test_streams_and_centers_come_along(folder):
+    names = ("center", "reference", "reference_pointsampled", "stream")
+    place = folder("shot.0001.exr", *(f"{name}.0001.exr" for name in names), "stream.0002.exr")
+    (shot,) = find_frames(place)
+    assert shot.path == place / "shot.0001.exr"
+    assert shot.center == place / "center.0001.exr"
+    assert shot.reference_pointsampled == place / "reference_pointsampled.0001.exr"
+    assert shot.streams == (place / "stream.0001.exr",)
+    first, second = find_frames(place / "stream.####.exr")
+    assert (first.path, first.center) == (place / "stream.0001.exr", place / "center.0001.exr")
+    assert (second.center, second.reference) == (None, None)
+
+
+def test_a_folder_of_companions_alone_gives_the_center_else_the_stream(folder):
+    place = folder("reference.0001.exr", "stream01.0001.exr", "stream02.0001.exr")
+    assert find_frames(place)[0].path == place / "stream01.0001.exr"
+    folder("center.0001.exr")
+    assert find_frames(place)[0].path == place / "center.0001.exr"
+
+
+def test_samples_are_in_their_order(folder):
+    place = folder("shot.7.exr", "stream.7.exr", *(f"stream{k}.7.exr" for k in (10, 2, 1, 9)))
+    (shot,) = find_frames(place)
+    assert [path.name for path in shot.streams] == [f"stream{k}.7.exr" for k in (1, 2, 9, 10)]
+
+
 def test_refusals_name_what_is_there(folder, tmp_path):
-    place = folder("center.0001.exr", "stream.0001.exr")
-    with pytest.raises(FileFormatError, match=r"several sequences: center, stream; name one: .*"):
+    place = folder("center.0001.exr", "left.0001.exr", "right.0001.exr")
+    with pytest.raises(FileFormatError, match=r"several sequences: left, right; name one: .*"):
         find_frames(place)
     with pytest.raises(FileFormatError, match=r"no frames fit .*x\.####\.exr; .*center\.0001\.exr"):
         find_frames(place / "x.####.exr")

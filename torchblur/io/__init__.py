@@ -4,6 +4,7 @@ from torchblur.io.conventions import CONVENTIONS, Convention, ConventionOverride
 from torchblur.io.exr import ExrFile, ExrPart, Window, read_exr, read_metadata, write_exr
 from torchblur.io.frames import read_channels, read_frame, read_image
 from torchblur.io.inspect import Inspection, inspect_file
+from torchblur.io.readsequence import read_sequence
 from torchblur.io.sequences import FrameFiles, find_frames
 from torchblur.io.writing import write_frame, write_image
 from torchblur.io.yaml import line_of, load_yaml, save_yaml
@@ -27,6 +28,7 @@ __all__ = [
     "read_frame",
     "read_image",
     "read_metadata",
+    "read_sequence",
     "save_yaml",
     "write_exr",
     "write_frame",

@@ -39,6 +39,7 @@ CHANNEL_FIELDS = (
     "normal",
     "object_id",
     "time",
+    "albedo",
     "variance",
     "acceleration",
 )
@@ -73,6 +74,7 @@ class Convention(Config):
     normal: tuple[Triple, ...] = ()
     object_id: tuple[str, ...] = ()
     time: tuple[str, ...] = ()
+    albedo: tuple[Triple, ...] = ()
     variance: tuple[Triple, ...] = (("variance.R", "variance.G", "variance.B"),)
     acceleration: tuple[Pair, ...] = ()
 
@@ -98,6 +100,10 @@ class Convention(Config):
     depth_far: float = Field(default=1000.0, gt=0)
     depth_zero: Literal["background", "invalid"] = "background"
     """What a planar depth of 0 means: nothing was hit there (read as +inf), or an error."""
+    time_start: float = 0.0
+    """The stored time at which the shutter opens; -0.5 where the frame itself is 0 …"""
+    time_end: float = 1.0
+    """… and at which it closes."""
 
     def override(self, overrides: ConventionOverrides) -> Convention:
         """Return the convention with some fields replaced."""
@@ -131,6 +137,7 @@ class ConventionOverrides(Config):
     normal: Triple | None = None
     object_id: str | None = None
     time: str | None = None
+    albedo: Triple | None = None
     variance: Triple | None = None
     acceleration: Pair | None = None
     velocity_unit: Unit | None = None
@@ -145,6 +152,8 @@ class ConventionOverrides(Config):
     depth_near: float | None = Field(default=None, gt=0)
     depth_far: float | None = Field(default=None, gt=0)
     depth_zero: Literal["background", "invalid"] | None = None
+    time_start: float | None = None
+    time_end: float | None = None
 
 
 CONVENTIONS: Mapping[str, Convention] = {
@@ -163,6 +172,7 @@ CONVENTIONS: Mapping[str, Convention] = {
             normal=(("normal.X", "normal.Y", "normal.Z"),),
             object_id=("id",),
             time=("time",),
+            albedo=(("albedo.R", "albedo.G", "albedo.B"),),
         ),
         Convention(
             name="blender",

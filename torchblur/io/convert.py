@@ -7,9 +7,10 @@ import math
 import torch
 from torch import Tensor
 
+from torchblur.errors import ConfigError
 from torchblur.io.conventions import Convention
 
-__all__ = ["depth_to_distance", "mean_and_change", "velocity_to_pixels"]
+__all__ = ["depth_to_distance", "mean_and_change", "time_to_shutter", "velocity_to_pixels"]
 
 
 def velocity_to_pixels(
@@ -83,3 +84,22 @@ def depth_to_distance(stored: Tensor, convention: Convention) -> Tensor:
         return distance * convention.depth_scale
     numerator = near if convention.depth_kind == "reversed" else 1.0
     return torch.where(stored == 0, math.inf, numerator / stored * convention.depth_scale)
+
+
+def time_to_shutter(stored: Tensor, convention: Convention) -> Tensor:
+    """Convert stored times to times over the shutter, 0 the opening, 1 the closing.
+
+    Args:
+        stored: As the file has it, (1, 1, H, W).
+        convention: The times at which the shutter opens and closes.
+
+    Returns:
+        Times, (1, 1, H, W).
+
+    Raises:
+        ConfigError: if the shutter opens and closes at one time.
+    """
+    start, end = convention.time_start, convention.time_end
+    if start == end:
+        raise ConfigError(f"`time_start` and `time_end` must differ, got {start} for both")
+    return (stored - start) / (end - start)

@@ -23,7 +23,12 @@ from torchblur.io.conventions import (
     ConventionOverrides,
     resolve_convention,
 )
-from torchblur.io.convert import depth_to_distance, mean_and_change, velocity_to_pixels
+from torchblur.io.convert import (
+    depth_to_distance,
+    mean_and_change,
+    time_to_shutter,
+    velocity_to_pixels,
+)
 from torchblur.io.exr import Window, read_exr
 from torchblur.io.sequences import FrameFiles, find_frames
 from torchblur.params import build
@@ -60,8 +65,8 @@ def read_frame(
             the color, overscan included.
         on_invalid: "raise", or "mask" to replace NaN and inf (see `Frame`).
         **overrides: Fields of `ConventionOverrides`: ``velocity=("u", "v")``, ``depth=...``,
-            ``velocity_scale=...``, ``velocity_y="down"`` … If no convention is known for the
-            file, they start from torchblur's own.
+            ``velocity_scale=...``, ``velocity_y="down"``, ``time_start=-0.5`` … If no convention
+            is known for the file, they start from torchblur's own.
 
     Returns:
         A frame of batch size 1, float32; object ids int64.
@@ -166,7 +171,8 @@ class _Layers:
             depth=self._depth(),
             normal=self._read(data.find_group(convention.normal)),
             object_id=self._ids(),
-            time=self._read(data.find_group((name,) for name in convention.time)),
+            time=self._time(),
+            albedo=self._read(data.find_group(convention.albedo)),
             acceleration=acceleration,
             revealed=revealed,
             valid=self._valid(),
@@ -230,6 +236,12 @@ class _Layers:
                 + '; depth_zero="background", depth_scale=-1 or depth_kind=... may fit the file'
             )
         return distance
+
+    def _time(self) -> Tensor | None:
+        convention = self.convention
+        planes = self.data.find_group((name,) for name in convention.time)
+        stored = self._read(planes, convention.time_start)
+        return None if stored is None else time_to_shutter(stored, convention)
 
     def _ids(self) -> Tensor | None:
         planes = self.data.find_group((name,) for name in self.convention.object_id)

@@ -12,7 +12,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from torch import Tensor
 
 from torchblur.errors import TorchblurError
 from torchblur.frame import Frame, Shutter
@@ -25,13 +24,19 @@ from torchblur.io.conventions import (
 )
 from torchblur.io.exr import ExrPart, Window, read_exr
 from torchblur.io.frames import read_frame, read_image
-from torchblur.io.motioncheck import BlurCheck, SignMatch, check_blur, compare_signs
+from torchblur.io.motioncheck import (
+    BlurCheck,
+    SignMatch,
+    VelocityInfo,
+    check_blur,
+    check_speed,
+    compare_signs,
+)
+from torchblur.io.timecheck import TimeInfo, about_time, check_time
 from torchblur.params import build
 
-__all__ = ["ChannelInfo", "Inspection", "PartInfo", "VelocityInfo", "inspect_file"]
+__all__ = ["ChannelInfo", "Inspection", "PartInfo", "inspect_file"]
 
-_MOVING = 0.5
-"""Least speed in px/frame that counts as moving."""
 _SAME_DB = 0.05
 _TYPE_NAMES = {"float16": "half", "float32": "float", "uint32": "uint"}
 
@@ -63,19 +68,6 @@ class PartInfo:
 
 
 @dataclass(frozen=True)
-class VelocityInfo:
-    """Speeds in px/frame: median, 95th percentile and maximum of the pixels that move.
-
-    Moving is 0.5 px/frame and more; `moving_share` is their share of all pixels.
-    """
-
-    median: float
-    percentile_95: float
-    maximum: float
-    moving_share: float
-
-
-@dataclass(frozen=True)
 class Inspection:
     """Plain data about a file, for a person or a program.
 
@@ -88,6 +80,7 @@ class Inspection:
         evidence: How sure the entry of the table is: verified, documentation or memory.
         recognized: Channels by role: color, depth, velocity …
         velocity: Speeds, if there is a velocity.
+        time: Times of the pixels, if there is a time: a stream, if they differ.
         blur: Whether the color is blurred already.
         signs: Match with the reference per change of the velocity, best first.
         warnings: What looks wrong, one sentence each; empty if nothing does.
@@ -102,6 +95,7 @@ class Inspection:
     evidence: str
     recognized: Mapping[str, tuple[str, ...]]
     velocity: VelocityInfo | None
+    time: TimeInfo | None
     blur: BlurCheck | None
     signs: tuple[SignMatch, ...]
     warnings: tuple[str, ...]
@@ -155,10 +149,13 @@ def inspect_file(
         findings.warnings.append(str(error))
     roles = {} if chosen is None else _recognized(catalog, chosen)
     findings.warnings[:0] = _bad_values(catalog.planes, roles.get("depth", ()))
-    blur, signs = None, []
+    blur, times, signs = None, None, []
     if chosen is not None and frame is not None:
         blur = check_blur(frame.color, frame.velocity)
         findings.about_values(roles, chosen, frame, blur)
+        if frame.time is not None:
+            times = check_time(frame.time)
+            findings.warnings += about_time(roles["time"][0].label, times)
         if reference is not None:
             signs = findings.about_signs(reference, frame, shutter or Shutter())
     return Inspection(
@@ -169,7 +166,8 @@ def inspect_file(
         convention="" if chosen is None else chosen.name,
         evidence="" if chosen is None else chosen.evidence,
         recognized={role: tuple(p.label for p in planes) for role, planes in roles.items()},
-        velocity=None if frame is None else _speeds(frame.velocity),
+        velocity=None if frame is None else check_speed(frame.velocity),
+        time=times,
         blur=blur,
         signs=tuple(signs),
         warnings=tuple(findings.warnings),
@@ -222,15 +220,6 @@ def _recognized(catalog: Catalog, convention: Convention) -> dict[str, tuple[Pla
         if planes is not None:
             roles[role] = planes
     return roles
-
-
-def _speeds(velocity: Tensor) -> VelocityInfo:
-    speed = velocity.norm(dim=1).numpy()
-    moving = speed[speed >= _MOVING]
-    if not moving.size:
-        return VelocityInfo(0.0, 0.0, float(speed.max()), 0.0)
-    median, high = (float(q) for q in np.percentile(moving, [50, 95]))
-    return VelocityInfo(median, high, float(moving.max()), moving.size / speed.size)
 
 
 # -- what looks wrong --------------------------------------------------------------------------

@@ -1,23 +1,40 @@
-"""Do color and velocity fit together? Two checks of a frame that was read from a file."""
+"""How fast a frame moves, and whether color and velocity fit together."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
 from torchblur.frame import Shutter
 
-__all__ = ["BlurCheck", "SignMatch", "check_blur", "compare_signs"]
+__all__ = ["BlurCheck", "SignMatch", "VelocityInfo", "check_blur", "check_speed", "compare_signs"]
+
+_MOVING = 0.5
+"""Least speed in px/frame that counts as moving."""
 
 _FAST = 12.0
 """Least speed in px/frame at which blur in the color can be told."""
 _NEAR, _FAR = 2.0, 6.0
 _MIN_PIXELS = 500
 _SMOOTH_ALONG, _SMOOTHER_THAN_ACROSS = 0.21, 0.87
+
+
+@dataclass(frozen=True)
+class VelocityInfo:
+    """Speeds in px/frame: median, 95th percentile and maximum of the pixels that move.
+
+    Moving is 0.5 px/frame and more; `moving_share` is their share of all pixels.
+    """
+
+    median: float
+    percentile_95: float
+    maximum: float
+    moving_share: float
 
 
 @dataclass(frozen=True)
@@ -49,6 +66,16 @@ class SignMatch:
 
     change: str
     psnr: float
+
+
+def check_speed(velocity: Tensor) -> VelocityInfo:
+    """Return the speeds of a velocity in px/frame, (1, 2, H, W)."""
+    speed = velocity.norm(dim=1).numpy()
+    moving = speed[speed >= _MOVING]
+    if not moving.size:
+        return VelocityInfo(0.0, 0.0, float(speed.max()), 0.0)
+    median, high = (float(q) for q in np.percentile(moving, [50, 95]))
+    return VelocityInfo(median, high, float(moving.max()), moving.size / speed.size)
 
 
 def check_blur(color: Tensor, velocity: Tensor) -> BlurCheck:

@@ -11,7 +11,16 @@ from torchblur.errors import FileFormatError
 
 __all__ = ["FrameFiles", "find_frames"]
 
-_COMPANIONS = ("gbuffer", "reference", "revealed", "revealed_gbuffer")
+_COMPANIONS = (
+    "center",
+    "gbuffer",
+    "reference",
+    "reference_pointsampled",
+    "revealed",
+    "revealed_gbuffer",
+)
+_PREFIXES = ("gbuffer", "reference", "revealed")
+_STREAM = re.compile(r"stream\d*")
 _NUMBERED = re.compile(r"^(?P<stem>.*?)(?P<separator>[._-]?)(?P<number>\d+)\.exr$", re.IGNORECASE)
 _PLACEHOLDER = re.compile(r"#+|%0?\d*d|\*")
 
@@ -27,6 +36,11 @@ class FrameFiles:
         reference: The frame with true motion blur (`reference.####.exr`), if there.
         revealed: What lies behind the moving objects (`revealed.####.exr`), if there.
         revealed_gbuffer: Its point-sampled layers (`revealed_gbuffer.####.exr`), if there.
+        center: The frame as one sample at each pixel's center sees it (`center.####.exr`).
+        reference_pointsampled: The mean over the shutter at each pixel's center
+            (`reference_pointsampled.####.exr`): what a stream converges to.
+        streams: Each pixel at a random time of its own: `stream.####.exr` with one sample per
+            pixel, or `stream01.####.exr`, `stream02.####.exr` … of several.
     """
 
     number: int
@@ -35,6 +49,9 @@ class FrameFiles:
     reference: Path | None = None
     revealed: Path | None = None
     revealed_gbuffer: Path | None = None
+    center: Path | None = None
+    reference_pointsampled: Path | None = None
+    streams: tuple[Path, ...] = ()
 
 
 def find_frames(place: str | Path) -> list[FrameFiles]:
@@ -42,8 +59,10 @@ def find_frames(place: str | Path) -> list[FrameFiles]:
 
     Args:
         place: A folder; a pattern `folder/NAME.####.exr` (also `%04d` or `*`); or one file.
-            A folder may hold one sequence (or one frame) beside the companions `gbuffer`,
-            `reference`, `revealed` and `revealed_gbuffer`; of several, `sharp` is taken.
+            A folder may hold one sequence (or one frame) beside its companions, which
+            `FrameFiles` lists; of several, `sharp` is taken. Where there are companions alone,
+            it is `center`, or else the stream: a sharp frame comes before a noisy one, and
+            ``folder/stream.####.exr`` names the stream.
 
     Returns:
         One entry per frame; 2 comes before 10 whatever the padding.
@@ -84,9 +103,11 @@ def _main_sequence(folder: Path) -> list[Path]:
     groups: dict[str, list[Path]] = {}
     for path in _exr_files(folder):
         groups.setdefault(_stem(path), []).append(path)
-    names = [name for name in groups if not name.startswith(_COMPANIONS)]
+    names = [name for name in groups if not _is_companion(name)]
     if "sharp" in names:
         return groups["sharp"]
+    if not names:
+        names = [name for name in ("center", *_stream_names(groups)) if name in groups][:1]
     if len(names) > 1 and not any(_number(path) is None for n in names for path in groups[n]):
         raise FileFormatError(
             f"{folder} holds several sequences: {', '.join(sorted(names))}; name one: "
@@ -109,13 +130,25 @@ def _in_order(paths: Iterable[Path]) -> list[FrameFiles]:
     return [_with_companions(number, by_number[number]) for number in sorted(by_number)]
 
 
+def _is_companion(name: str) -> bool:
+    return name.startswith(_PREFIXES) or name == "center" or bool(_STREAM.fullmatch(name))
+
+
 def _with_companions(number: int, path: Path) -> FrameFiles:
-    found: dict[str, Path] = {}
     own, digits = _stem(path), _number(path)
-    for other in _exr_files(path.parent):
-        if _number(other) == digits and _stem(other) in _COMPANIONS and _stem(other) != own:
-            found[_stem(other)] = other
-    return FrameFiles(number=number, path=path, **found)
+    beside = {_stem(p): p for p in _exr_files(path.parent) if _number(p) == digits}
+    found = {name: beside[name] for name in _COMPANIONS if name in beside and name != own}
+    if _STREAM.fullmatch(own):  # what its pixels show is of other times than a G-buffer's
+        for name in ("gbuffer", "revealed", "revealed_gbuffer"):
+            found.pop(name, None)
+    streams = tuple(beside[name] for name in _stream_names(beside))
+    return FrameFiles(number=number, path=path, streams=streams, **found)
+
+
+def _stream_names(names: Iterable[str]) -> list[str]:
+    """Return the names of streams in the order of their samples; `stream` alone counts for 1."""
+    found = sorted(filter(_STREAM.fullmatch, names), key=lambda name: (len(name), name))
+    return [name for name in found if name != "stream"] or found
 
 
 def _stem(path: Path) -> str:

@@ -24,6 +24,7 @@ _FRAME_CHANNELS = {
     "object_id": ("id",),
     "time": ("time",),
     "acceleration": ("acceleration.X", "acceleration.Y"),
+    "albedo": ("albedo.R", "albedo.G", "albedo.B"),
     "valid": ("valid",),
 }
 
