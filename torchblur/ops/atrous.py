@@ -32,6 +32,7 @@ __all__ = [
 Kernel = Literal["b3", "box"]
 """B3 spline, ``[1, 4, 6, 4, 1] / 16`` in each direction, or all weights alike."""
 
+_LEAST_PART = 1e-4  # of W between pixels; less may be rounding of a position on a pixel
 _ROWS = {"b3": (1 / 16, 4 / 16, 6 / 16, 4 / 16, 1 / 16), "box": (0.2,) * 5}
 
 
@@ -251,7 +252,7 @@ def _path_tap(index: Tensor, count: Tensor, inputs: Inputs, options: _Path) -> t
         values, weight = planes[:-1], planes[-1:]
     else:
         planes, x, y = _bilinear(inputs["x"] + dx, inputs["y"] + dy, inputs)
-        weight = planes[-1:]
+        weight = torch.where(planes[-1:] > _LEAST_PART, planes[-1:], 0.0)
         values = planes[:-1] / torch.where(weight > 0, weight, 1.0)
     offset = (inputs["x"] - x, inputs["y"] - y)
     values, velocity = values[:-2], (values[-2:-1], values[-1:])

@@ -14,6 +14,7 @@ from torch import Tensor
 __all__ = ["Projection", "path_distance", "path_weight", "project", "width_of_weights"]
 
 _STILL_SQUARED = 1e-6  # a thousandth of a pixel: no line to project on
+_LEAST_WEIGHT = 1e-4  # rounding makes weights up to 1e-5 of what is exactly as far as c
 
 
 class Projection(NamedTuple):
@@ -88,14 +89,16 @@ def path_weight(
         softness: e >= 0, as a share of the path.
 
     Differentiable: yes; the ends are steps unless e is above 0.
-    Reference: Oberberger 2022, section 4.3. We differ: negative weights are cut, and the ends
-        may be soft.
+    Reference: Oberberger 2022, section 4.3. We differ: negative weights are cut, and those below
+        1/10000, so that rounding does not decide whether a sample is seen (uniform motion puts
+        the taps across it at a distance of exactly c = 1 px); and the ends may be soft.
     """
     share, distance = project(*offset, *velocity, time)
     beyond = torch.maximum(-share, share - 1)
     ramp = (1 - beyond / torch.where(softness > 0, softness, 1.0)).clamp(0, 1)
     inside = torch.where(beyond <= 0, 1.0, torch.where(softness > 0, ramp, 0.0))
-    return (1 - distance / width).clamp(0, 1) * inside
+    weight = (1 - distance / width).clamp(0, 1)
+    return torch.where(weight > _LEAST_WEIGHT, weight, 0.0) * inside
 
 
 def width_of_weights(
