@@ -7,14 +7,17 @@ from torchblur.render.renderer import (
     render_reference,
     render_stream,
 )
+from torchblur.render.revealed import Revealed, render_revealed
 from torchblur.render.scene import Scene, load_scene
 
 __all__ = [
     "Reference",
     "Renderer",
+    "Revealed",
     "Scene",
     "load_scene",
     "render_frame",
     "render_reference",
+    "render_revealed",
     "render_stream",
 ]

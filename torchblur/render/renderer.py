@@ -18,6 +18,7 @@ from torch import Tensor
 from torchblur.errors import ConfigError
 from torchblur.frame import Frame, Shutter
 from torchblur.render.compiling import Engine, check_engine
+from torchblur.render.sampling import spread_positions
 from torchblur.render.scene import Scene
 from torchblur.render.stream import StreamTracer, random_planes
 from torchblur.render.surface import pixel_centers, surface_layers
@@ -36,7 +37,6 @@ PixelFilter = Literal["box", "center"]
 """Where in a pixel its samples lie: anywhere, or all at its center."""
 
 _WORTH_COMPILING = 1e8  # rays times bodies: half a minute of eager work on one core
-_STEP_X, _STEP_Y = 0.7548776662466927, 0.5698402909980532  # R2 sequence: 1/p, 1/p², p³ = p + 1
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -122,7 +122,6 @@ class Renderer:
         mean, variance = self._sampled(size, spp, interval, frame, seed, pixel)
         return Reference(mean=_image(mean, size), variance=_image(variance, size), spp=spp)
 
-    @torch.no_grad()
     def stream(
         self,
         size: tuple[int, int],
@@ -135,16 +134,33 @@ class Renderer:
     ) -> list[Frame]:
         """Return the frames of a stochastic stream; see `render_stream`."""
         _check(size, spp, "spp", frame)
+        return [
+            self.stream_sample(size, k, frame=frame, shutter=shutter, seed=seed, jitter=jitter)
+            for k in range(spp)
+        ]
+
+    @torch.no_grad()
+    def stream_sample(
+        self,
+        size: tuple[int, int],
+        sample: int,
+        *,
+        frame: float = 0.0,
+        shutter: Shutter | None = None,
+        seed: int = 0,
+        jitter: bool = False,
+    ) -> Frame:
+        """Return one sample of a stream, from 0: that of `stream` at its place in the list."""
+        _check(size, 1, "spp", frame)
+        if not _is_count(sample + 1):
+            raise ConfigError(f"`sample` must be an integer of at least 0, got {sample!r}")
         tracer = StreamTracer(
-            self.scene, frame, device=self.device, compiled=self._compiles(size, spp)
+            self.scene, frame, device=self.device, compiled=self._compiles(size, 1)
         )
-        count = size[0] * size[1]
-        frames = []
-        for sample in range(spp):
-            time, *shift = random_planes(seed, frame, sample, (3 if jitter else 1, count))
-            moved = torch.stack(shift).double() - 0.5 if jitter else None
-            frames.append(tracer.frame(size, shutter or Shutter(1.0), time, moved))
-        return frames
+        planes = (3 if jitter else 1, size[0] * size[1])
+        time, *shift = random_planes(seed, frame, sample, planes)
+        moved = torch.stack(shift).double() - 0.5 if jitter else None
+        return tracer.frame(size, shutter or Shutter(1.0), time, moved)
 
     def _compiles(self, size: tuple[int, int], spp: int) -> bool:
         work = size[0] * size[1] * spp * self._num_bodies
@@ -309,11 +325,10 @@ def _samples(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Return x, y and time of all samples of some pixels, (spp, pixels) each, float32."""
     count = pixels.shape[0]
-    shift_x, shift_y = torch.rand((2, 1, count), generator=generator).unbind(0)
+    shift = torch.rand((2, count), generator=generator)
     jitter = torch.rand((spp, count), generator=generator)
     index = torch.arange(spp, dtype=torch.float64)[:, None]
-    x = ((index * _STEP_X % 1).float() + shift_x) % 1
-    y = ((index * _STEP_Y % 1).float() + shift_y) % 1
+    x, y = spread_positions(spp, shift)
     if pixel == "center":
         x, y = torch.full_like(x, 0.5), torch.full_like(y, 0.5)
     start, end = interval
