@@ -13,11 +13,11 @@ from twins.oberberger2022_pixels import (
     Still,
     Sum,
     at,
-    clamp,
     depth_weight,
     is_inside,
     kernel_taps,
     motion_weight,
+    moving_at,
     remodulated,
     sample_grid,
     sat,
@@ -62,50 +62,57 @@ def oberberger2022(frames, history=None, *, times=None, jitter=None, **changes):
     planes = {}
     for x, y in everywhere:
         motion, color = motions[y][x], tuple(colors[:, y, x])
-        weights = moving[y][x].weight, static[y][x].weight
-        alpha = blend_factor(motion, *weights, settings)
-        result = color
-        if motion.active:
-            result = compose(filtered[y][x], static[y][x], alpha, color)
-        seen = {
-            "color": result,
-            "mean_length": motion.length,
-            "mean_angle": motion.angle,
-            "length_variance": motion.length_variance,
-            "angle_variance": motion.angle_variance,
-            "alpha": alpha,
-            "prefiltered": np.mean([remodulated(grid[y][x]) for grid in values], axis=0),
-            "moving": remodulated(filtered[y][x].value) if filtered[y][x].weight else (0, 0, 0),
-            "static": remodulated(static[y][x].value) if static[y][x].weight else (0, 0, 0),
-            "moving_weight": weights[0],
-            "static_weight": weights[1],
-            "reprojected": collected[x, y][2],
-        }
+        outcome, channels = collected[x, y][2], (moving[y][x], static[y][x], filtered[y][x])
+        seen = look_at(motion, channels, outcome, color, settings)
+        seen["prefiltered"] = remodulated(values[0][y][x])
         for name, value in seen.items():
             shape = (np.size(value), rows, columns)
             planes.setdefault(name, np.zeros(shape))[:, y, x] = value
     return planes, history
 
 
+def look_at(motion, channels, outcome, color, settings):
+    """What is shown of one pixel; 0 where nothing moves nearby."""
+    moving, static, filtered = channels
+    if not motion.active:
+        moving, static = Moving(), Still()
+    alpha = blend_factor(motion, moving.weight, static.weight, settings)
+    black = (0.0, 0.0, 0.0)
+    return {
+        "color": compose(filtered, static, alpha, color) if motion.active else color,
+        "mean_length": motion.length,
+        "mean_angle": motion.angle,
+        "length_variance": motion.length_variance,
+        "angle_variance": motion.angle_variance,
+        "blend": alpha,
+        "moving": remodulated(moving.value or black),
+        "moving_weight": moving.weight,
+        "static": remodulated(static.value or black),
+        "static_weight": static.weight,
+        "reprojection": outcome,
+        "second_stage": remodulated(filtered.value or black),
+    }
+
+
 def collect(grids, values, p, motion, history, settings):
-    """(moving, static, reprojected?) at p: first stage and what the history adds."""
+    """(moving, static, outcome of the reprojection) at p: first stage and what history adds."""
     x, y = p
     own = grids[0][y][x]
     if not motion.active:
         value = np.mean([grid[y][x].value for grid in grids], axis=0)
-        return Moving(), Still(tuple(value), 0.0 if own.moving else 1.0), False
+        return Moving(), Still(tuple(value), 1.0 if own.still else 0.0), 0
     moving, static = first_stage(grids, values, x, y, motion.c, settings)
-    place = None
+    outcome = 0
     if history is not None:
         current = Moving.of(moving)
         if current.weight > 0:
-            place = reproject(p, current.u, history.moving, settings)
-        if place is not None:
+            place, outcome = reproject(p, current.u, history.moving, settings)
+        if outcome > 0:
             add_moving_history(moving, history.moving, place, motion.c, settings)
-        keeps_own = settings.static_filter == "own" and not own.moving
+        keeps_own = settings.static_filter == "own" and own.still
         add_static_history(static, history.static, p, keeps_own, settings)
     still = Still(static.mean(), static.weight) if static.weight > 0 else Still()
-    return Moving.of(moving), still, place is not None
+    return Moving.of(moving), still, outcome
 
 
 def remember(moving, static, settings):
@@ -157,7 +164,7 @@ def estimate(grids, x, y, settings):
             for column in range(x - before, x + after + 1):
                 q, _ = at(grid, column, row)
                 d = depth_weight(center.z, q.z, settings)
-                total += d
+                total += d if q.moving or q.still else 0.0
                 if q.moving and d > 0:
                     weighted.append((d, q))
     n = sum(a for a, _ in weighted)
@@ -257,7 +264,7 @@ def first_stage(grids, values, x, y, c, settings):
     """(moving, static) sums at (x, y) over the 5x5 pixels around it, of all sample frames."""
     p = grids[0][y][x]
     taps = kernel_taps(settings) if settings.first_stage else [(0, 0, 1.0)]
-    keeps_own = settings.static_filter == "own" and not p.moving
+    keeps_own = settings.static_filter == "own" and p.still
     moving, static = Sum(), Sum()
     for grid, value_of in zip(grids, values, strict=True):
         for o_x, o_y, h in taps:
@@ -267,9 +274,9 @@ def first_stage(grids, values, x, y, c, settings):
                 a = h * motion_weight((x, y), place, q.v, q.t, c, settings)
                 a *= 1.0 if p.moving else depth_weight(p.z, q.z, settings)
                 moving.add(a, (*value, *q.u, q.t))
-            elif not keeps_own:
+            elif q.still and not keeps_own:
                 static.add(h, value)
-            elif (o_x, o_y) == (0, 0):
+            elif q.still and (o_x, o_y) == (0, 0):
                 static.add(1.0, value)
     return moving, static
 
@@ -278,23 +285,23 @@ def first_stage(grids, values, x, y, c, settings):
 
 
 def reproject(p, u_p, history, settings):
-    """The pixel of the history that moved to p, or None."""
+    """The pixel of the history that moved to p and the evaluation that found it, or None, -1."""
     q = (p[0] - u_p[0], p[1] - u_p[1])
-    for _ in range(settings.reprojection_iterations):
+    for evaluation in range(1, settings.reprojection_iterations + 1):
         column, row = round(q[0]), round(q[1])
         if not is_inside(history, column, row) or history[row][column].weight == 0:
-            return None
+            return None, -1
         u_q = history[row][column].u
         delta = (
             (p[0] - u_p[0] / 2) - (q[0] + u_q[0] / 2),
             (p[1] - u_p[1] / 2) - (q[1] + u_q[1] / 2),
         )
         if length(delta) < settings.accept_threshold:
-            return column, row
+            return (column, row), evaluation
         if length(delta) > max(settings.cancel_threshold, length(u_p)):
-            return None
+            return None, -1
         q = (q[0] + delta[0], q[1] + delta[1])
-    return None
+    return None, -1
 
 
 def add_moving_history(moving, history, k, c, settings):
@@ -335,27 +342,6 @@ def displacement(o_x, o_y, motion, i, settings):
         cosine, sine = math.cos(motion.angle), math.sin(motion.angle)
         x, y = cosine * x - sine * y, sine * x + cosine * y
     return (round(x), round(y)) if settings.lookup == "nearest" else (x, y)
-
-
-def bilinear(channel, x, y):
-    """(valid part, mean data of it, place) between the four pixels around (x, y)."""
-    x, y = clamp(x, 0, len(channel[0]) - 1), clamp(y, 0, len(channel) - 1)
-    total = Sum()
-    for row in (math.floor(y), math.floor(y) + 1):
-        for column in (math.floor(x), math.floor(x) + 1):
-            b = (1 - abs(x - column)) * (1 - abs(y - row))
-            pixel, _ = at(channel, column, row)
-            if pixel.weight > 0:
-                total.add(b, pixel.data())
-    return total.weight, total.mean() if total.weight > 0 else None, (x, y)
-
-
-def moving_at(channel, x, y, settings):
-    """(valid part, data, place) of the moving channel at (x, y)."""
-    if settings.lookup == "bilinear":
-        return bilinear(channel, x, y)
-    pixel, place = at(channel, x, y)
-    return float(pixel.weight > 0), pixel.data(), place
 
 
 def second_stage(channel, x, y, motion, i, settings):

@@ -11,6 +11,8 @@ from types import SimpleNamespace
 
 from twins.reconstruction import FAR_DEPTH, dot, length, scaled
 
+LEAST = 1e-4  # a weight that is no more may be rounding of 0, and is 0
+
 DEFAULTS = {
     "shutter": 0.5,
     "shutter_position": "centered",  # not read: a sample's time says all
@@ -73,6 +75,7 @@ class Sample:
     t: float
     speed: float  # |v|
     moving: bool
+    still: bool  # neither, if it cannot be trusted
 
 
 @dataclass(frozen=True)
@@ -138,8 +141,8 @@ class Still:
 
 def demodulated(color, albedo, settings):
     """Light, then albedo: what is filtered in place of the color."""
-    light = tuple(c / max(a, settings.albedo_floor) for c, a in zip(color, albedo, strict=True))
-    return light + albedo
+    albedo = tuple(max(a, settings.albedo_floor) for a in albedo)
+    return tuple(c / a for c, a in zip(color, albedo, strict=True)) + albedo
 
 
 def remodulated(value):
@@ -162,8 +165,10 @@ def sample_grid(frame, settings):
         if settings.demodulate:
             color = demodulated(color, plane("albedo", x, y), settings)
         z = min(plane("depth", x, y)[0], FAR_DEPTH)
-        moving = length(v) >= settings.moving_threshold
-        return Sample(color, z, u, v, plane("time", x, y)[0], length(v), moving)
+        moves = length(v) >= settings.moving_threshold
+        trusted = "valid" not in frame or bool(frame["valid"][0, y, x])
+        kinds = moves and trusted, not moves and trusted
+        return Sample(color, z, u, v, plane("time", x, y)[0], length(v), *kinds)
 
     _, rows, columns = frame["depth"].shape
     return [[sample(x, y) for x in range(columns)] for y in range(rows)]
@@ -190,6 +195,29 @@ def is_inside(grid, x, y):
     return 0 <= y < len(grid) and 0 <= x < len(grid[0])
 
 
+def bilinear(channel, x, y):
+    """(valid part, mean data of it, place) between the four pixels around (x, y)."""
+    x, y = clamp(x, 0, len(channel[0]) - 1), clamp(y, 0, len(channel) - 1)
+    total = Sum()
+    for row in (math.floor(y), math.floor(y) + 1):
+        for column in (math.floor(x), math.floor(x) + 1):
+            b = (1 - abs(x - column)) * (1 - abs(y - row))
+            pixel, _ = at(channel, column, row)
+            if pixel.weight > 0:
+                total.add(b, pixel.data())
+    if total.weight <= LEAST:
+        return 0.0, None, (x, y)
+    return total.weight, total.mean(), (x, y)
+
+
+def moving_at(channel, x, y, settings):
+    """(valid part, data, place) of the moving channel at (x, y)."""
+    if settings.lookup == "bilinear":
+        return bilinear(channel, x, y)
+    pixel, place = at(channel, x, y)
+    return float(pixel.weight > 0), pixel.data(), place
+
+
 def kernel_taps(settings):
     """(o_x, o_y, h) of the 5x5 kernel."""
     row = {"b3": (1 / 16, 4 / 16, 6 / 16, 4 / 16, 1 / 16), "box": (0.2,) * 5}[settings.kernel]
@@ -205,7 +233,7 @@ def segment_distance(p, q, v, t, *, clamped=False):
     """(distance, l): from p to the line that q moves along, and where on it p comes to lie."""
     q0 = (q[0] - v[0] * t, q[1] - v[1] * t)
     to_p = (p[0] - q0[0], p[1] - q0[1])
-    if dot(v, v) == 0:
+    if length(v) < 1e-3:
         return length(to_p), 0.5
     along = dot(to_p, v) / dot(v, v)
     nearest = clamp(along, 0.0, 1.0) if clamped else along
@@ -223,4 +251,7 @@ def edge(along, softness):
 def motion_weight(p, q, v, t, c, settings):
     """w(p, q): could what is at q at time t be at p at another time?"""
     distance, along = segment_distance(p, q, v, t)
-    return sat(1 - distance / c) * edge(along, settings.segment_softness)
+    weight = sat(1 - distance / c)
+    if weight <= LEAST:
+        return 0.0
+    return weight * edge(along, settings.segment_softness)

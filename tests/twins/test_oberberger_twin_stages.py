@@ -8,7 +8,7 @@ import pytest
 from twins import oberberger2022 as ob
 from twins.frames import moved_stream, still_stream
 from twins.oberberger2022 import oberberger2022
-from twins.oberberger2022_pixels import Motion, Moving, sample_grid, settings_of
+from twins.oberberger2022_pixels import Motion, Moving, bilinear, sample_grid, settings_of
 
 FULL = settings_of({"shutter": 1.0})
 WHOLE = {"shutter": 1.0, "prefilter": False}
@@ -78,14 +78,14 @@ def history_of(ux, weight=1.0, columns=20):
 @pytest.mark.parametrize(
     ("ux", "changes", "found"),
     [
-        (4.0, {}, (6, 1)),
-        (4.0, {"reprojection_iterations": 1}, (6, 1)),
-        (1.0, {}, (8, 1)),  # 1.5 px off, then 0, at x = 7.5: even is 8
-        (1.0, {"reprojection_iterations": 1}, None),
-        (1.0, {"accept_threshold": 1.6}, (6, 1)),
-        (1.0, {"cancel_threshold": 1.0}, (8, 1)),  # |u_p| = 4 is what counts
-        (16.0, {"cancel_threshold": 5.0}, None),  # 6 px off
-        (16.0, {}, (0, 1)),
+        (4.0, {}, ((6, 1), 1)),
+        (4.0, {"reprojection_iterations": 1}, ((6, 1), 1)),
+        (1.0, {}, ((8, 1), 2)),  # 1.5 px off, then 0, at x = 7.5: even is 8
+        (1.0, {"reprojection_iterations": 1}, (None, -1)),
+        (1.0, {"accept_threshold": 1.6}, ((6, 1), 1)),
+        (1.0, {"cancel_threshold": 1.0}, ((8, 1), 2)),  # |u_p| = 4 is what counts
+        (16.0, {"cancel_threshold": 5.0}, (None, -1)),  # 6 px off
+        (16.0, {}, ((0, 1), 2)),
     ],
 )
 def test_reprojection(ux, changes, found):
@@ -95,8 +95,8 @@ def test_reprojection(ux, changes, found):
 
 def test_reprojection_fails_outside_and_where_nothing_moved():
     settings = settings_of({})
-    assert ob.reproject((3, 1), (4.0, 0.0), history_of(4.0), settings) is None
-    assert ob.reproject((10, 1), (4.0, 0.0), history_of(4.0, weight=0.0), settings) is None
+    assert ob.reproject((3, 1), (4.0, 0.0), history_of(4.0), settings) == (None, -1)
+    assert ob.reproject((10, 1), (4.0, 0.0), history_of(4.0, weight=0.0), settings) == (None, -1)
 
 
 def test_history_adds_up_to_its_limit(rng):
@@ -107,7 +107,7 @@ def test_history_adds_up_to_its_limit(rng):
     assert planes["moving_weight"][0, 4, 12] == pytest.approx(row)
     planes, history = oberberger2022([frame], history, **WHOLE)
     assert planes["moving_weight"][0, 4, 12] == pytest.approx(row + row**2)
-    assert planes["reprojected"][0, 4, 12] == 1
+    assert planes["reprojection"][0, 4, 12] == 1
     limited = WHOLE | {"history_limit": 0.1}
     _, history = oberberger2022([frame], **limited)
     planes, _ = oberberger2022([frame], history, **limited)
@@ -158,9 +158,9 @@ def test_second_stage_along_the_motion(rng):
 
 def test_bilinear_leaves_out_what_is_not_valid():
     row = [Moving((1.0,), (4.0, 0.0), 0.5, 1.0), Moving(), Moving((3.0,), (4.0, 0.0), 0.5, 1.0)]
-    part, data, place = ob.bilinear([row, row], 0.25, 0.5)
+    part, data, place = bilinear([row, row], 0.25, 0.5)
     assert (part, data[0], place) == (0.75, 1.0, (0.25, 0.5))
-    part, data, place = ob.bilinear([row, row], 7.0, -3.0)
+    part, data, place = bilinear([row, row], 7.0, -3.0)
     assert (part, data[0], place) == (1.0, 3.0, (2, 0))
 
 
@@ -200,4 +200,4 @@ def test_one_color_stays(lookup, rng):
     for _ in range(2):
         planes, history = oberberger2022([frame], history, **randoms, shutter=1.0, lookup=lookup)
         np.testing.assert_allclose(planes["color"], frame["color"])
-        assert 0 < planes["alpha"][0, 4, 6] < 1
+        assert 0 < planes["blend"][0, 4, 6] < 1
