@@ -275,15 +275,39 @@ def render(  # noqa: PLR0913 - each argument is an option
         float, typer.Option(metavar="S", help="Open time as a fraction of a frame.")
     ] = 0.5,
     seed: Annotated[int, typer.Option(metavar="N", help="Seed of the random samples.")] = 0,
+    start: Annotated[float, typer.Option(metavar="T", help="Time of the first frame.")] = 0.0,
+    stream: Annotated[
+        bool, typer.Option("--stream", help="Also stream.####.exr: each pixel at a random time.")
+    ] = False,
+    stream_spp: Annotated[
+        int | None, typer.Option(metavar="N", help="Samples per pixel of the stream. Default: 1.")
+    ] = None,
+    point_sampled: Annotated[
+        bool,
+        typer.Option(
+            "--point-sampled",
+            help="Also reference_pointsampled.####.exr: what the stream converges to.",
+        ),
+    ] = False,
     overwrite: Overwrite = False,
 ) -> None:
     """Render a procedural scene: sharp frames with all layers, and references beside them.
 
-    Files that are done are kept, so a stopped run goes on when started again.
+    Files that are done are kept, so a stopped run goes on when started again. Several samples per
+    pixel of a stream are files of their own: stream01.####.exr, stream02.####.exr …
     """
     from tuning.rendering import find_scene, render_sequence, settings_of
 
-    settings = settings_of(size, spp=spp, frames=frames, shutter=shutter, seed=seed)
+    settings = settings_of(
+        size,
+        spp=spp,
+        frames=frames,
+        start=start,
+        shutter=shutter,
+        seed=seed,
+        stream_spp=(1 if stream else 0) if stream_spp is None else stream_spp,
+        point_sampled=point_sampled,
+    )
     try:
         with show_progress() as progress:
             files = render_sequence(

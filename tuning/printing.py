@@ -179,6 +179,13 @@ def _facts(found: Inspection) -> Iterable[tuple[str, str]]:
             f"{speed.moving_share:.1%} of the pixels move: median {speed.median:.1f}, 95 % "
             f"{speed.percentile_95:.1f}, greatest {speed.maximum:.1f} px/frame",
         )
+    if found.time is not None and found.time.is_stream:
+        times = found.time
+        yield (
+            "a stream",
+            f"times {times.minimum:.3f} to {times.maximum:.3f}, mean {times.mean:.3f}; distance "
+            f"to uniform {times.distance:.3f}, correlation of neighbors {times.neighbors:.3f}",
+        )
     if found.metadata:
         yield "metadata", json.dumps(dict(found.metadata), ensure_ascii=False)
 

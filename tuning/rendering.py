@@ -1,10 +1,10 @@
-"""Rendering sequences of a procedural scene to files: sharp frames, and references beside them."""
+"""Rendering sequences of a scene to files: sharp frames, and streams and references beside them."""
 
 from __future__ import annotations
 
 import hashlib
 import re
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,7 +15,7 @@ from torchblur.errors import ConfigError, OutputError, nearest_name
 from torchblur.frame import LONGEST_SHUTTER, Shutter, ShutterPosition
 from torchblur.io import write_frame, write_image
 from torchblur.params import Config, build
-from torchblur.render import Scene, load_scene, render_frame, render_reference
+from torchblur.render import Renderer, Scene, load_scene, render_frame, render_reference
 from tuning.outputs import made_by, make_folders, remove_leftovers, state_of
 from tuning.progress import Progress, Stage
 
@@ -29,12 +29,19 @@ class RenderSettings(Config):
 
     width: int = Field(640, ge=1, le=16384, description="px")
     height: int = Field(360, ge=1, le=16384, description="px")
-    frames: int = Field(1, ge=1, description="number of frames, from time 0 on")
+    frames: int = Field(1, ge=1, description="number of frames, one apart")
+    start: float = Field(0.0, description="time of frame 0000, in frames")
     spp: int = Field(256, ge=2, description="samples per pixel of the reference")
     color_spp: int = Field(16, ge=1, description="samples per pixel of the sharp color")
     shutter: float = Field(0.5, ge=0, le=LONGEST_SHUTTER, description="open time in frames")
     shutter_position: ShutterPosition = "centered"
-    seed: int = Field(0, ge=0, description="of frame 0; each frame has the next")
+    seed: int = Field(
+        0, ge=0, description="of frame 0000; each frame has the next, a stream one for all"
+    )
+    stream_spp: int = Field(0, ge=0, description="samples per pixel of the stream; 0: no stream")
+    point_sampled: bool = Field(
+        False, description="also render references of pixel centers, as streams are"
+    )
 
 
 @dataclass(frozen=True)
@@ -42,6 +49,7 @@ class _Task:
     """One file of a frame."""
 
     kind: str
+    sample: int
     number: int
     path: Path
     recipe: Mapping[str, Any]
@@ -89,8 +97,10 @@ def render_sequence(
 ) -> list[Path]:
     """Render a scene to `NAME.####.exr` and `reference.####.exr`; files that are done are kept.
 
-    The number in the names is the time in frames. A sharp frame has all layers; a reference has
-    the layer `variance`, the variance of its mean.
+    The number in the names counts frames from the start. A sharp frame has all layers; a
+    reference has the layer `variance`, the variance of its mean. If asked for, there are
+    `reference_pointsampled.####.exr`, and a stream: `stream.####.exr` for one sample per pixel,
+    `stream01.####.exr`, `stream02.####.exr` … for several, with `time` and `albedo`.
 
     Args:
         path: File of the scene; its stem is NAME.
@@ -128,33 +138,56 @@ def render_sequence(
 
 def _tasks(path: Path, scene: Scene, folder: Path, settings: RenderSettings) -> list[_Task]:
     digest = hashlib.sha256(scene.model_dump_json().encode()).hexdigest()[:16]
-    common = {"scene": digest} | settings.model_dump(mode="json", exclude={"frames"})
+    # What does not change a file is not in its recipe, nor are settings that came later.
+    others = {"frames", "start", "stream_spp", "point_sampled"}
+    common = {"scene": digest} | settings.model_dump(mode="json", exclude=others)
     return [
         _Task(
             kind=kind,
+            sample=sample,
             number=number,
-            path=folder / f"{path.stem if kind == 'frame' else kind}.{number:04d}.exr",
-            recipe=common | {"kind": kind, "frame": number},
+            path=folder / f"{path.stem if kind == 'frame' else name}.{number:04d}.exr",
+            recipe=common | {"kind": name, "frame": settings.start + number},
         )
         for number in range(settings.frames)
-        for kind in ("frame", "reference")
+        for kind, sample, name in _kinds(settings)
     ]
+
+
+def _kinds(settings: RenderSettings) -> Iterator[tuple[str, int, str]]:
+    """List the files of a frame: kind, sample of the stream, and name."""
+    yield "frame", 0, "frame"
+    for sample in range(settings.stream_spp):
+        yield "stream", sample, "stream" if settings.stream_spp == 1 else f"stream{sample + 1:02d}"
+    yield "reference", 0, "reference"
+    if settings.point_sampled:
+        yield "reference", 0, "reference_pointsampled"
 
 
 def _render(
     task: _Task, scene: Scene, settings: RenderSettings, metadata: Mapping[str, Any]
 ) -> None:
     size = (settings.height, settings.width)
-    seed = settings.seed + task.number
+    time, seed = settings.start + task.number, settings.seed + task.number
+    shutter = Shutter(settings.shutter, settings.shutter_position)
     if task.kind == "frame":
-        frame = render_frame(
-            scene, size, frame=task.number, color_spp=settings.color_spp, seed=seed
-        )
+        frame = render_frame(scene, size, frame=time, color_spp=settings.color_spp, seed=seed)
         write_frame(task.path, frame, metadata=metadata, overwrite=True)
         return
-    shutter = Shutter(settings.shutter, settings.shutter_position)
+    if task.kind == "stream":
+        stream = Renderer(scene).stream_sample(
+            size, task.sample, frame=time, shutter=shutter, seed=settings.seed
+        )
+        write_frame(task.path, stream, metadata=metadata, overwrite=True)
+        return
     result = render_reference(
-        scene, size, spp=settings.spp, shutter=shutter, frame=task.number, seed=seed
+        scene,
+        size,
+        spp=settings.spp,
+        shutter=shutter,
+        frame=time,
+        seed=seed,
+        pixel="center" if task.recipe["kind"] == "reference_pointsampled" else "box",
     )
     layers = {"variance": result.variance}
     write_image(

@@ -242,6 +242,9 @@ def test_more_samples_begin_with_the_same(crossing):
     assert torch.equal(one[0].color, three[0].color)
     assert not (three[0].time == three[1].time).any()
     assert not (three[1].time == three[2].time).any()
+    third = crossing.stream_sample((6, 10), 2, seed=4)
+    assert torch.equal(third.color, three[2].color)
+    assert torch.equal(third.time, three[2].time)
     jittered = crossing.stream((6, 10), seed=4, jitter=True)[0]
     assert torch.equal(jittered.time, one[0].time)
     assert not torch.equal(jittered.depth, one[0].depth)
@@ -277,6 +280,11 @@ def test_compiled_streams_are_the_same(crossing):
 def test_bad_arguments_are_refused(make_scene, glow, arguments, message):
     with pytest.raises(ConfigError, match=message):
         render_stream(make_scene(bar(glow, 1.0)), **({"size": SIZE} | arguments))
+
+
+def test_samples_are_counted_from_0(crossing):
+    with pytest.raises(ConfigError, match=r"`sample` must be an integer of at least 0, got -1"):
+        crossing.stream_sample((6, 10), -1)
 
 
 def test_unknown_pixel_filter_is_refused(make_scene, glow):
