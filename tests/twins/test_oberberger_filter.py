@@ -31,21 +31,23 @@ CASES = [
 
 
 def stream(rng, index, *, samples=1):
-    """n sample frames: sky, ground that stands still or creeps, and a block that moves past.
+    """n sample frames: sky, ground that creeps, and a block that moves past.
 
-    Every vector differs a little, some point elsewhere; a few pixels of the ground show the block.
+    Every vector differs a little, some point elsewhere; a few pixels of the ground show the
+    block. In the lower left corner nothing but the block moves.
     """
     y, x = np.indices((ROWS, COLUMNS))
+    calm = (y > 8) & (x < 9)
     left = 2 + 3 * index
     frames = []
     for _ in range(samples):
-        block = (y > 4) & (y < 11) & (x >= left) & (x < left + 8)
-        block ^= rng.uniform(0, 1, block.shape) < 0.15
+        block = (y > 2) & (y < 9) & (x >= left) & (x < left + 8)
+        block ^= (rng.uniform(0, 1, block.shape) < 0.15) & ~calm
         velocity = 0.2 * rng.normal(size=(2, ROWS, COLUMNS))
         velocity += np.where(block, np.array([4.0, 1.0])[:, None, None], 0)
-        wild = rng.uniform(0, 1, block.shape) < 0.06
+        wild = (rng.uniform(0, 1, block.shape) < 0.06) & ~calm
         velocity += np.where(wild, rng.normal(0, 9, velocity.shape), 0)
-        velocity[:, :, :2] = rng.normal(0, 3, (2, ROWS, 2))
+        velocity[:, :5, :2] = rng.normal(0, 3, (2, 5, 2))
         depth = np.where(block, rng.uniform(1.9, 2.1, block.shape), 2.3)
         depth = np.where(wild, rng.uniform(1, 3, block.shape), depth)
         depth[:3, 9:] = np.inf
