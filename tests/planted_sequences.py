@@ -1,12 +1,15 @@
 """A small filter with a memory, and sequences whose references are its own output."""
 
-from typing import Annotated, ClassVar
+import dataclasses
+from pathlib import Path
+from typing import Annotated, Any, ClassVar
 
 import torch
 import torch.nn.functional as F
 
 from torchblur.filters.base import _REGISTRY, FilterConfig, History, TemporalBlur
 from torchblur.frame import Frame, Sequence, Shutter
+from torchblur.io import write_frame, write_image
 from torchblur.metrics import border_band
 from torchblur.params import Param
 from tuning.cases import SequenceCase
@@ -91,3 +94,32 @@ def sequence_case(
         identities=tuple(f"{seed} {index}" for index in range(count)),
         origin=str(seed),
     )
+
+
+def write_sequences(root: Path, count: int = 4) -> dict[str, Any]:
+    """Write two planted sequences as EXR; return a configuration that fits the first."""
+    for seed, name in ((1, "first"), (2, "second")):
+        folder = root / name
+        folder.mkdir(parents=True)
+        case = sequence_case(count, seed)
+        for number, frame in enumerate(case.samples[0], start=1):
+            write_frame(folder / f"stream.{number:04d}.exr", frame, half=False)
+            sharp = dataclasses.replace(frame, time=None)
+            write_frame(folder / f"center.{number:04d}.exr", sharp, half=False)
+            reference = case.references[number - 1]
+            write_image(folder / f"reference.{number:04d}.exr", reference, half=False)
+    items = [
+        {"kind": "exr_stream", "path": name, "center": "center.####.exr"}
+        for name in ("first", "second")
+    ]
+    return {
+        "filter": {"kind": "recall", "free": ["gain"]},
+        "data": {"root": str(root), "train": items[:1], "holdout": items[1:]},
+        "objective": {"terms": {"l1": 1.0}, "color_space": "linear", "temporal": 0.5},
+        "methods": [
+            {"kind": "gradient", "steps": 40, "starts": 2, "learning_rate": 0.1, "unroll": 2},
+            {"kind": "blackbox", "sampler": "tpe", "trials": 4},
+        ],
+        "seed": 5,
+        "device": "cpu",
+    }

@@ -24,10 +24,11 @@ from torchblur.params import Config, build
 from tuning.cases import Case
 from tuning.data import load_cases
 from tuning.data_config import DataItem, DataSpec, ExrData, SceneData
-from tuning.evaluation import Variant, noise_scores, render, score_image
+from tuning.evaluation import noise_scores, score_image
 from tuning.overrides import apply_overrides
 from tuning.progress import Progress, Stage
 from tuning.rendering import find_scene
+from tuning.variants import Variant, render
 
 __all__ = [
     "AblationConfig",

@@ -51,6 +51,7 @@ _METRICS = {
     "flip": ("FLIP", ".4f", "less"),
     "psnr": ("PSNR", ".2f", "more"),
     "ssim": ("SSIM", ".4f", "more"),
+    "temporal": ("change", ".4f", "less"),
 }
 
 
@@ -225,6 +226,8 @@ def _style(name: str, value: float, best: float, unranked: Sequence[str]) -> str
 
 def _label(key: str) -> str:
     metric, _, mask = key.partition("_")
+    if metric == "temporal":
+        return "change\nin time"
     where = {"": "image", "band": "borders"}.get(mask, mask)
     return f"{_METRICS[metric][0]}\n{where}"
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -12,80 +11,57 @@ from torch import Tensor
 
 from torchblur.filters import BlurFilter
 from torchblur.metrics import evaluate
-from tuning.blurring import blurred
+from tuning.cases import AnyCase, Case, SequenceCase
 from tuning.config import GradientMethod, ObjectiveSpec
-from tuning.data import Case
 from tuning.gradient import GradientJob, fit_gradient
 from tuning.problem import Problem
 from tuning.progress import Stage
 from tuning.result import CaseScore
+from tuning.sequence_scores import finite_or_none, noisy_frames, score_frames
 from tuning.space import Space
+from tuning.variants import Variant, render, render_frames
 from tuning.windows import make_samples
 
 __all__ = [
-    "Variant",
     "ceiling",
     "noise_scores",
-    "render",
     "score_cases",
     "score_image",
+    "score_variant",
     "sensitivities",
 ]
 
 _STEP = 0.05  # of each range, for the sensitivities
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Variant:
-    """An image to be scored: a filter with values, or the sharp frame.
-
-    Args:
-        name: Its name in tables.
-        blur: The filter; None leaves the frame as it is.
-        values: Values over the filter's own.
-        free: Names of the free parameters, whose values are not taken from the data.
-    """
-
-    name: str
-    blur: BlurFilter | None = None
-    values: Mapping[str, Any] | None = None
-    free: tuple[str, ...] = ()
-
-
-@torch.no_grad()
-def render(variant: Variant, case: Case) -> Tensor:
-    """Return the image of a variant for a case, (1, 3, H, W), scene-linear."""
-    if variant.blur is None:
-        return case.frame.color
-    return blurred(
-        variant.blur,
-        case.frame,
-        case.shutter.open,
-        case.shutter.position,
-        variant.values or {},
-        variant.free,
-    )
-
-
 def score_cases(
-    cases: Sequence[Case], variants: Sequence[Variant], stage: Stage | None = None
+    cases: Sequence[AnyCase], variants: Sequence[Variant], stage: Stage | None = None
 ) -> list[CaseScore]:
     """Return the figures of all variants on all cases, and the noise of the references.
 
     Args:
-        cases: Frames of both splits.
-        variants: What is scored.
+        cases: Frames and sequences of both splits.
+        variants: What is scored, where a case has it.
         stage: Is told of each case.
     """
     scores: list[CaseScore] = []
     for done, case in enumerate(cases):
-        for variant in variants:
-            scores.append(score_image(case, variant.name, render(variant, case)))
-        if case.variance is not None:
+        scores += [score_variant(case, variant) for variant in variants if variant.fits(case)]
+        if isinstance(case, SequenceCase):
+            if case.variances is not None:
+                scores.append(score_frames(case, "noise", noisy_frames(case)))
+        elif case.variance is not None:
             scores.append(noise_scores(case))
         if stage is not None:
             stage.step(done + 1, message=case.name)
     return scores
+
+
+def score_variant(case: AnyCase, variant: Variant) -> CaseScore:
+    """Return the figures of a variant on a case."""
+    if isinstance(case, SequenceCase):
+        return score_frames(case, variant.name, render_frames(variant, case))
+    return score_image(case, variant.name, render(variant, case))
 
 
 def noise_scores(case: Case) -> CaseScore:
@@ -104,17 +80,17 @@ def noise_scores(case: Case) -> CaseScore:
 
 
 def ceiling(
-    case: Case,
+    case: AnyCase,
     blur: BlurFilter,
     space: Space,
     values: Mapping[str, Any],
     objective: ObjectiveSpec,
     steps: int,
 ) -> Mapping[str, Any]:
-    """Return the parameters that suit one frame best: what no common set can beat by much.
+    """Return the parameters that suit one frame or sequence best: no common set beats them by much.
 
     Args:
-        case: The frame.
+        case: The frame, or the sequence.
         blur: The filter.
         space: All free parameters; the smooth ones are fitted.
         values: The tuned values, where this fit begins.
@@ -134,7 +110,7 @@ def ceiling(
         first=(values,),
         seed=0,
     )
-    samples = make_samples([case], None, tile_size=1, seed=0)
+    samples = make_samples([case], None, tile_size=1, seed=0, blur=blur)
     return fit_gradient(Problem(blur, samples, objective, space.names), job).params
 
 
@@ -177,9 +153,5 @@ def score_image(case: Case, variant: str, image: Tensor) -> CaseScore:
         case=case.name,
         split="train" if case.split == "train" else "holdout",
         variant=variant,
-        scores={name: _finite_or_none(float(value)) for name, value in figures.items()},
+        scores={name: finite_or_none(float(value)) for name, value in figures.items()},
     )
-
-
-def _finite_or_none(value: float) -> float | None:
-    return value if math.isfinite(value) else None

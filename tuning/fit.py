@@ -19,9 +19,10 @@ from torchblur.errors import ConfigError
 from torchblur.filters import BlurFilter, get_filter
 from torchblur.presets import Preset, save_preset
 from tuning.blackbox import BlackBoxJob, fit_blackbox
+from tuning.cases import AnyCase, SequenceCase, check_needs
 from tuning.config import GradientMethod, TuneConfig, free_names, resolve
-from tuning.data import Case, load_cases
-from tuning.evaluation import Variant, ceiling, score_cases, sensitivities
+from tuning.data import load_cases
+from tuning.evaluation import ceiling, score_cases, score_variant, sensitivities
 from tuning.gradient import GradientJob, fit_gradient
 from tuning.problem import Problem
 from tuning.progress import Progress, ProgressEvent, Stage
@@ -29,11 +30,21 @@ from tuning.report import write_report
 from tuning.result import CaseScore, FitResult, MethodResult, ParameterResult
 from tuning.runfolder import RunFolder, open_run
 from tuning.space import Space, make_space
+from tuning.variants import Variant
 from tuning.windows import make_samples
 
 __all__ = ["run_fit"]
 
-_HEADLINE = ("flip", "psnr", "ssim", "flip_band", "psnr_band", "ssim_band")
+_HEADLINE = (
+    "flip",
+    "psnr",
+    "ssim",
+    "flip_band",
+    "psnr_band",
+    "ssim_band",
+    "flip_median",
+    "temporal",
+)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -45,7 +56,7 @@ class _Setting:
     progress: Progress | None
     space: Space
     blur: BlurFilter
-    cases: list[Case]
+    cases: list[AnyCase]
     problem: Problem
     notes: tuple[str, ...]
 
@@ -111,9 +122,12 @@ def _prepare(config: TuneConfig, folder: RunFolder, progress: Progress | None) -
         notes += ("There is no hold-out: these figures are of the frames that were fitted.",)
     space = make_space(config.filter)
     blur = get_filter(config.filter.kind)(engine=config.engine, **config.filter.params).to(device)
+    check_needs(blur, cases)
     train = [case for case in cases if case.split == "train"]
     tile_size = int(getattr(blur.config, "tile_size", 16))
-    samples = make_samples(train, config.data.crops, tile_size=tile_size, seed=config.seed)
+    samples = make_samples(
+        train, config.data.crops, tile_size=tile_size, seed=config.seed, blur=blur
+    )
     for parameter in blur.parameters():
         parameter.requires_grad_(False)
     problem = Problem(blur, samples, config.objective, space.names)
@@ -193,13 +207,16 @@ def _evaluate(
 def _variants(
     setting: _Setting, methods: Sequence[MethodResult], tuned: dict[str, Any]
 ) -> list[Variant]:
-    """Return what is scored: sharp, line, the filter as published, before and after the fit."""
+    """Return what is scored: frames, line, the filter as published, before and after the fit."""
     blur, free = setting.blur, setting.space.names
+    device = _device(setting.config.device)
     variants = [Variant(name="sharp")]
+    if any(isinstance(case, SequenceCase) for case in setting.cases):
+        variants.append(Variant(name="input", stream=True))
     if blur.name != "line":
-        line = get_filter("line")().to(setting.cases[0].frame.device)
+        line = get_filter("line")().to(device)
         variants.append(Variant(name="line", blur=line))
-    published = get_filter(blur.name)().to(setting.cases[0].frame.device)
+    published = get_filter(blur.name)().to(device)
     variants.append(Variant(name="default", blur=published))
     start = setting.space.start()
     if _not_default(blur, setting.config.filter.params | start):
@@ -221,7 +238,7 @@ def _ceiling_scores(setting: _Setting, tuned: dict[str, Any]) -> list[CaseScore]
         variant = Variant(
             name="ceiling", blur=setting.blur, values=values, free=setting.space.names
         )
-        scores += [s for s in score_cases([case], [variant]) if s.variant == "ceiling"]
+        scores.append(score_variant(case, variant))
         stage.step(done + 1, message=case.name)
     return scores
 

@@ -17,7 +17,7 @@ from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 
 from tuning.result import FitResult, MethodResult, ParameterResult
 
-__all__ = ["loss_curves", "parameter_paths"]
+__all__ = ["color_of", "loss_curves", "parameter_paths", "style", "svg_of"]
 
 _GRAY = "#7d8590"
 _COLORS = ("#3b82f6", "#f59e0b", "#10b981", "#ec4899", "#8b5cf6", "#14b8a6", "#ef4444", "#a3a300")
@@ -40,6 +40,16 @@ _STYLE: Any = {
 }
 _WIDE = 60  # ratio of the ends of an axis above which only powers of ten are labeled
 Records = Sequence[Mapping[str, Any]]
+
+
+def style() -> Any:
+    """Return the settings of matplotlib that all plots share, for `rc_context`."""
+    return _STYLE
+
+
+def color_of(index: int) -> str:
+    """Return the color of a line; they come around again."""
+    return _COLORS[index % len(_COLORS)]
 
 
 def loss_curves(result: FitResult, records: Records) -> Markup:
@@ -67,7 +77,7 @@ def loss_curves(result: FitResult, records: Records) -> Markup:
             )
             axes.title.set_fontsize(10)
             axes.legend(fontsize=8)
-        return _svg(figure, "loss")
+        return svg_of(figure, "loss")
 
 
 def parameter_paths(result: FitResult, records: Records, index: int) -> Markup:
@@ -91,25 +101,25 @@ def parameter_paths(result: FitResult, records: Records, index: int) -> Markup:
             draw = _draw_path if method.kind == "gradient" else _draw_slice
             draw(axes, steps, parameter, method)
             axes.set_title(_label(parameter), fontsize=9)
-        return _svg(figure, f"paths{index}")
+        return svg_of(figure, f"paths{index}")
 
 
 def _draw_starts(axes: Axes, steps: Records) -> None:
     xs = [record["step"] for record in steps]
     for start in range(len(steps[0]["loss"]) if steps else 0):
         ys = [_number(record["loss"][start]) for record in steps]
-        axes.plot(xs, ys, color=_color(start), linewidth=1.4, label=f"start {start + 1}")
+        axes.plot(xs, ys, color=color_of(start), linewidth=1.4, label=f"start {start + 1}")
 
 
 def _draw_trials(axes: Axes, steps: Records) -> None:
     xs = [record["step"] for record in steps]
     ys = [_number(record["loss"][0]) for record in steps]
-    axes.plot(xs, ys, ".", color=_color(0), markersize=3.5, alpha=0.6, label="trial")
+    axes.plot(xs, ys, ".", color=color_of(0), markersize=3.5, alpha=0.6, label="trial")
     best, lowest = [], math.inf
     for y in ys:
         lowest = lowest if math.isnan(y) else min(lowest, y)
         best.append(lowest)
-    axes.plot(xs, best, color=_color(1), linewidth=1.4, label="best so far")
+    axes.plot(xs, best, color=color_of(1), linewidth=1.4, label="best so far")
     finite = sorted(y for y in ys if math.isfinite(y))
     if finite:
         top = finite[min(len(finite) - 1, int(0.9 * len(finite)))]
@@ -121,7 +131,7 @@ def _draw_path(axes: Axes, steps: Records, parameter: ParameterResult, _: Method
     xs = [record["step"] for record in steps]
     for start in range(len(steps[0]["loss"])):
         ys = [record["params"][parameter.name][start] for record in steps]
-        axes.plot(xs, ys, color=_color(start), linewidth=1.2)
+        axes.plot(xs, ys, color=color_of(start), linewidth=1.2)
     if parameter.scale == "log":
         axes.set_yscale("log")
         _plain_numbers(axes.yaxis)
@@ -168,12 +178,13 @@ def _number(value: float | None) -> float:
     return math.nan if value is None else value
 
 
-def _color(index: int) -> str:
-    return _COLORS[index % len(_COLORS)]
+def svg_of(figure: Figure, salt: str) -> Markup:
+    """Return a figure as an `svg` element that scales with the page and has ids of its own.
 
-
-def _svg(figure: Figure, salt: str) -> Markup:
-    """Return a figure as an `svg` element that scales with the page and has ids of its own."""
+    Args:
+        figure: What was drawn.
+        salt: Unique name within the page.
+    """
     buffer = io.StringIO()
     salted: Any = {"svg.hashsalt": salt}
     with mpl.rc_context(salted):

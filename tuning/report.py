@@ -12,13 +12,14 @@ import torch
 from markupsafe import Markup
 
 from torchblur.params import Param
+from tuning.cases import AnyCase, SequenceCase
 from tuning.config import TuneConfig
-from tuning.data import Case
-from tuning.evaluation import Variant, render
 from tuning.page import Column, Row, Table, View, make_view, render_page
 from tuning.plots import loss_curves, parameter_paths
 from tuning.result import FitResult, ParameterResult
 from tuning.runfolder import RunFolder
+from tuning.sequence_plots import score_curves
+from tuning.variants import Variant, render, render_frames
 
 __all__ = ["Verdict", "figures_table", "verdict_of", "write_report"]
 
@@ -31,8 +32,13 @@ _METRICS = {
     "psnr_band": Column(name="PSNR, borders", digits=2, better="high"),
     "ssim_band": Column(name="SSIM, borders", digits=4, better="high"),
 }
+_OF_SEQUENCES = {
+    "flip_median": Column(name="FLIP, weighted median", digits=4, better="low"),
+    "temporal": Column(name="change between frames", digits=4, better="low"),
+}
 _NOTES = {
     "sharp": "no filter",
+    "input": "the stream as it is",
     "line": "line blur along each pixel's own motion",
     "default": "as published",
     "start": "before the fit: the fixed values of the config",
@@ -41,6 +47,7 @@ _NOTES = {
     "noise": "a perfect image",
 }
 _UNRANKED = ("ceiling", "noise")
+_CURVES = ("default", "tuned", "line", "sharp", "input")
 _SPLITS = {"train": "Training", "holdout": "Hold-out"}
 _EXPLAINED = {
     "line": "“line” is Rosado's line blur with its own defaults.",
@@ -68,7 +75,7 @@ def write_report(
     folder: RunFolder,
     config: TuneConfig,
     result: FitResult,
-    cases: Sequence[Case],
+    cases: Sequence[AnyCase],
     variants: Sequence[Variant],
 ) -> Path:
     """Write `report.html` into a run folder.
@@ -77,13 +84,14 @@ def write_report(
         folder: The run; its log, config.yaml and preset.yaml are read.
         config: The resolved configuration.
         result: The run's result.
-        cases: Frames of both splits.
-        variants: What was scored; sharp, line, default and tuned are shown.
+        cases: Frames and sequences of both splits; of a sequence the middle one of its scored
+            frames is shown, and the curves over all of them.
+        variants: What was scored; sharp, input, line, default and tuned are shown.
 
     Returns:
         Where it lies.
     """
-    shown = [v for v in variants if v.name in ("default", "tuned", "line", "sharp")]
+    shown = [v for v in variants if v.name in _CURVES]
     # Hold-out first: these are the frames that say something.
     ordered = sorted(cases, key=lambda case: case.split != "holdout")
     views = [_view(i, case, shown) for i, case in enumerate(ordered[:_MAX_VIEWS])]
@@ -92,13 +100,14 @@ def write_report(
     page = render_page(
         "fit.html",
         result=result,
-        train_count=sum(case.split == "train" for case in cases),
+        train_text=_counted([case for case in cases if case.split == "train"]),
         verdict=verdict_of(result),
         notes=result.notes,
         tables=[t for split in ("holdout", "train") if (t := figures_table(result, split))],
         explanations=[text for n, text in _EXPLAINED.items() if n in result.variants()],
         views=views,
         left_out=len(ordered) - len(views),
+        curves=_curves(ordered[:_MAX_VIEWS], result),
         parameter_rows=_parameter_rows(result, importances),
         importances=importances,
         losses=loss_curves(result, records),
@@ -147,11 +156,14 @@ def figures_table(result: FitResult, split: str) -> Table | None:
         result: A fit's result.
         split: "train" or "holdout".
     """
-    count = len({score.case for score in result.scores if score.split == split})
+    scores = [score for score in result.scores if score.split == split]
+    columns = dict(_METRICS)
+    if any(score.frames for score in scores):
+        columns |= _OF_SEQUENCES
     rows = [
         Row(
             name=variant,
-            values=[result.mean(variant, split, metric) for metric in _METRICS],
+            values=[result.mean(variant, split, metric) for metric in columns],
             note=_NOTES.get(variant, ""),
             ranked=variant not in _UNRANKED,
             strong=variant == "tuned",
@@ -161,27 +173,62 @@ def figures_table(result: FitResult, split: str) -> Table | None:
     ]
     if not rows:
         return None
-    frames = f"{count} frame{'' if count == 1 else 's'}"
-    return Table(title=f"{_SPLITS[split]}: {frames}", columns=list(_METRICS.values()), rows=rows)
+    counted = [
+        _count(len({score.case for score in scores if bool(score.frames) == several}), name)
+        for several, name in ((False, "frame"), (True, "sequence"))
+    ]
+    title = f"{_SPLITS[split]}: {' and '.join(text for text in counted if text)}"
+    return Table(title=title, columns=list(columns.values()), rows=rows)
+
+
+def _counted(cases: Sequence[AnyCase]) -> str:
+    sequences = sum(isinstance(case, SequenceCase) for case in cases)
+    texts = [_count(len(cases) - sequences, "reference frame"), _count(sequences, "sequence")]
+    return " and ".join(text for text in texts if text)
+
+
+def _count(number: int, name: str) -> str:
+    return f"{number} {name}{'' if number == 1 else 's'}" if number else ""
 
 
 # -- sections --------------------------------------------------------------------------------------
 
 
-def _view(index: int, case: Case, variants: Sequence[Variant]) -> View:
-    order = ("default", "tuned", "line", "sharp")
-    chosen = sorted(variants, key=lambda variant: order.index(variant.name))
-    images = {variant.name: render(variant, case).cpu() for variant in chosen}
+def _view(index: int, case: AnyCase, variants: Sequence[Variant]) -> View:
+    chosen = sorted((v for v in variants if v.fits(case)), key=lambda v: _CURVES.index(v.name))
+    title = case.name
+    if isinstance(case, SequenceCase):
+        middle = (case.warm_up + len(case)) // 2
+        title = f"{case.name}, frame {case.labels[middle]}"
+        reference = case.references[middle]
+        images = {variant.name: render_frames(variant, case)[middle] for variant in chosen}
+    else:
+        reference = case.reference
+        images = {variant.name: render(variant, case) for variant in chosen}
     return make_view(
         str(index),
-        case.name,
-        images,
-        case.reference.cpu(),
+        title,
+        {name: image.cpu() for name, image in images.items()},
+        reference.cpu(),
         subtitle=f"{_SPLITS[case.split]} · shutter {case.shutter.open:g} frame, "
         f"{case.shutter.position}",
         mapped=[name for name in ("default", "tuned", "line") if name in images],
         right="tuned",
     )
+
+
+def _curves(cases: Sequence[AnyCase], result: FitResult) -> list[tuple[str, Markup]]:
+    """Return name and plot of each sequence."""
+    return [
+        (
+            case.name,
+            score_curves(
+                [s for s in result.scores if s.case == case.name], _CURVES, f"over{index}"
+            ),
+        )
+        for index, case in enumerate(cases)
+        if isinstance(case, SequenceCase)
+    ]
 
 
 def _parameter_rows(result: FitResult, importances: dict[str, float]) -> list[dict[str, Any]]:

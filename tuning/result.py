@@ -11,7 +11,7 @@ from pydantic import Field
 from torchblur.errors import ConfigError
 from torchblur.params import Config, build
 
-__all__ = ["CaseScore", "FitResult", "MethodResult", "ParameterResult", "StartResult"]
+__all__ = ["CaseScore", "FitResult", "FrameScore", "MethodResult", "ParameterResult", "StartResult"]
 
 Split = Literal["train", "holdout"]
 
@@ -63,15 +63,28 @@ class ParameterResult(Config):
     both directions); null for choices."""
 
 
+class FrameScore(Config):
+    """Figures of one frame of a sequence."""
+
+    label: str
+    """Its number."""
+    scored: bool
+    """Whether it counts; frames of the warm-up do not."""
+    scores: dict[str, float | None]
+
+
 class CaseScore(Config):
-    """Figures of one image against one reference."""
+    """Figures of one image against one reference, or of a sequence against its references."""
 
     case: str
     split: Split
     variant: str
-    """"default", "start", "tuned", "gradient", "sharp", "line", "ceiling", "noise" …"""
+    """"default", "start", "tuned", "gradient", "sharp", "input", "line", "ceiling", "noise" …"""
     scores: dict[str, float | None]
-    """flip, psnr, ssim and the same with _band; null where the band is empty."""
+    """flip, psnr, ssim and the same with _band; null where the band is empty. Of a sequence the
+    means over its scored frames, and flip_median and temporal beside them."""
+    frames: tuple[FrameScore, ...] = ()
+    """Of a sequence: its frames in order."""
 
 
 class FitResult(Config):
@@ -99,7 +112,8 @@ class FitResult(Config):
         Args:
             variant: As in `CaseScore.variant`.
             split: "train" or "holdout".
-            metric: "flip", "psnr", "ssim", "flip_band" …
+            metric: "flip", "psnr", "ssim", "flip_band" …; of sequences also "flip_median" and
+                "temporal"
         """
         values = [
             value
