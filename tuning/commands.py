@@ -17,6 +17,8 @@ import typer
 from typer.core import TyperGroup
 
 from tuning.console import metrics_table, print_error, print_warning, results, show_progress
+from tuning.evidence_commands import ablate, study
+from tuning.options import ConventionName, Overwrite, Set
 
 __all__ = ["app"]
 
@@ -91,25 +93,6 @@ app = typer.Typer(
     help="Differentiable motion-blur filters: tune them to reference renders, and apply them.",
     epilog="Exit codes: 0 done, 1 something failed, 2 bad input, 130 stopped with Ctrl-C.",
 )
-
-# -- arguments that several commands have ----------------------------------------------------------
-
-Set = Annotated[
-    list[str] | None,
-    typer.Option(
-        "--set",
-        metavar="KEY=VALUE",
-        help="Replace one key; the value is YAML, dots lead into mappings and lists. Repeatable.",
-    ),
-]
-Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace existing results.")]
-ConventionName = Annotated[
-    str,
-    typer.Option(
-        metavar="NAME",
-        help="Whose channel names, units and signs: auto, torchblur, blender, nuke …",
-    ),
-]
 
 
 def _show_version(value: bool) -> None:
@@ -352,37 +335,8 @@ def compare(
         results.print(f"page: {output}", soft_wrap=True)
 
 
-@app.command()
-def ablate(
-    config: Annotated[
-        Path,
-        typer.Argument(
-            metavar="CONFIG", help="The claims and their scenes; configs/ablations has examples."
-        ),
-    ],
-    output: Annotated[
-        Path | None,
-        typer.Option("-o", "--output", metavar="DIR", help="Folder. Default: runs/CONFIG."),
-    ] = None,
-    set_: Set = None,
-    overwrite: Overwrite = False,
-) -> None:
-    """Measure claims: a filter with a feature off and on, against references of their scenes.
-
-    The folder gets table.md, table.json, and ablation.html with a slider for each claim.
-    """
-    from tuning.ablation import load_ablation_config, run_ablation
-    from tuning.ablation_files import check_outputs, write_ablation
-    from tuning.printing import print_ablation
-
-    folder = output or Path("runs") / config.stem
-    loaded = load_ablation_config(config, set_ or [])
-    check_outputs(folder, overwrite=overwrite)
-    with show_progress() as progress:
-        rows = run_ablation(loaded, progress)
-    files = write_ablation(folder, loaded, rows, overwrite=overwrite)
-    print_ablation(loaded, rows)
-    results.print(f"page: {files[-1]}", soft_wrap=True)
+app.command()(ablate)
+app.command()(study)
 
 
 @app.command()

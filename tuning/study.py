@@ -1,0 +1,275 @@
+"""Studies: what filters make of frames and sequences, frame by frame, beside raw input.
+
+A study is data times variants. Each variant runs through each sequence in its order, with a
+memory of its own if its filter has one, and is compared with every reference. What is measured
+is kept per data and variant, so that a stopped study goes on where it was.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import hashlib
+import json
+import re
+import statistics
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+import torchblur
+from torchblur.errors import ConfigError, nearest_name
+from torchblur.filters import BlurFilter, History, TemporalBlur
+from torchblur.frame import Frame
+from torchblur.io.paths import output_file
+from torchblur.metrics import FlipReference, border_band, prepare_flip_ldr
+from tuning.images import write_color
+from tuning.progress import Progress, Stage
+from tuning.study_config import StudyConfig, StudyExr, StudyScene, StudyVariant, make_filter
+from tuning.study_data import Moment, identity_of, moments
+from tuning.study_figures import figures_of, hidden_mask, moving_mask, steadiness_of
+
+__all__ = ["Row", "mean_of", "part_file", "picture_file", "run_study", "slug"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Row:
+    """What one variant scored on some data against one of its references.
+
+    Args:
+        data: Name of the data.
+        variant: Name of the variant.
+        reference: Name of the reference.
+        figures: Lists with one figure per frame, by name; None where a mask was empty.
+        cpu_seconds: Median over the frames, of the filter alone; None for raw input.
+        estimated: Whether the input stands in for samples that are not there.
+    """
+
+    data: str
+    variant: str
+    reference: str
+    figures: Mapping[str, Sequence[float | None]]
+    cpu_seconds: float | None = None
+    estimated: bool = False
+
+    def mean(self, name: str) -> float | None:
+        """Return the mean of a figure over the frames that have it."""
+        return mean_of(self.figures.get(name, ()))
+
+
+def mean_of(values: Sequence[float | None]) -> float | None:
+    """Return the mean of the values that are there, or None."""
+    known = [value for value in values if value is not None]
+    return statistics.fmean(known) if known else None
+
+
+def run_study(config: StudyConfig, folder: Path, progress: Progress | None = None) -> list[Row]:
+    """Measure all variants on all data; what `folder` has already is not measured again.
+
+    Args:
+        config: What `load_study_config` returned.
+        folder: Gets `parts/` with one file per data and variant, and `pictures/`.
+        progress: Told after each frame.
+
+    Raises:
+        TorchblurError: files that cannot be read, data without what a filter needs.
+    """
+    (folder / "parts").mkdir(parents=True, exist_ok=True)
+    rows: list[Row] = []
+    for item in config.data:
+        wanted = config.variants_of(item)
+        missing = [v for v in wanted if not part_file(folder, config, item, v).is_file()]
+        if missing:
+            _measure(config, item, missing, folder, progress)
+        for variant in wanted:
+            text = part_file(folder, config, item, variant).read_text(encoding="utf-8")
+            rows += [Row(**record) for record in json.loads(text)["rows"]]
+    return rows
+
+
+def part_file(
+    folder: Path, config: StudyConfig, item: StudyScene | StudyExr, variant: StudyVariant
+) -> Path:
+    """Return where the figures of a variant on some data are kept.
+
+    Its name is made of all that they depend on: settings, files, and the source of filters,
+    operations and metrics.
+    """
+    parts = (
+        item.model_dump_json(exclude={"picture"}),
+        variant.model_dump_json(exclude={"only"}),
+        json.dumps([config.masks, config.mask_params], sort_keys=True),
+        identity_of(item),
+        _source_hash(),
+    )
+    digest = hashlib.sha256("\n".join(parts).encode()).hexdigest()[:16]
+    return folder / "parts" / f"{slug(item.name)}.{slug(variant.name)}.{digest}.json"
+
+
+def picture_file(folder: Path, item: StudyScene | StudyExr, name: str) -> Path:
+    """Return where the picture of a variant or of a reference ("reference NAME") is kept."""
+    return folder / "pictures" / slug(item.name) / f"{slug(name)}.png"
+
+
+# -- one set of data -------------------------------------------------------------------------------
+
+
+@dataclass
+class _Runner:
+    """One variant on its way through a sequence."""
+
+    variant: StudyVariant
+    blur: BlurFilter | None
+    history: History | None = None
+    before: tuple[Tensor, Mapping[str, Tensor]] | None = None
+    seconds: list[float] = field(default_factory=list)
+    figures: dict[str, dict[str, list[float | None]]] = field(default_factory=dict)
+    estimated: bool = False
+
+    @torch.no_grad()
+    def image(self, moment: Moment) -> tuple[Tensor, dict[str, float | None]]:
+        """Return the image of a frame, and figures that the filter tells of itself."""
+        variant = self.variant
+        if self.blur is None:
+            if variant.input == "sharp":
+                return moment.sharp.color, {}
+            self.estimated |= variant.samples in moment.estimated
+            return moment.raw[variant.samples], {}
+        frames = _frames(variant, moment)
+        began = time.process_time()
+        layers = self._layers(frames, moment)
+        self.seconds.append(time.process_time() - began)
+        if variant.layer not in layers:
+            raise ConfigError(
+                f"{self.blur.name} has no layer `{variant.layer}`"
+                f"{nearest_name(variant.layer, layers)} (variant {variant.name!r})"
+            )
+        return layers[variant.layer], _told(layers)
+
+    def _layers(self, frames: tuple[Frame, ...], moment: Moment) -> dict[str, Tensor]:
+        shutter: Any = {"shutter": moment.shutter.open, "shutter_position": moment.shutter.position}
+        if not isinstance(self.blur, TemporalBlur):
+            assert self.blur is not None
+            return self.blur.layers(frames[0], **shutter)
+        history = None if moment.first_of_shot else self.history
+        layers, self.history = self.blur.step(frames, history, **shutter)
+        return layers
+
+    def compare(
+        self,
+        moment: Moment,
+        image: Tensor,
+        told: Mapping[str, float | None],
+        judges: Mapping[str, FlipReference],
+        masks: Mapping[str, Tensor],
+    ) -> None:
+        """Keep the figures of an image against all references."""
+        before = None if moment.first_of_shot else self.before
+        for name, reference in moment.references.items():
+            figures = figures_of(image, reference, masks, judges[name])
+            figures["temporal"] = steadiness_of(
+                image, reference, before and (before[0], before[1][name])
+            )
+            lists = self.figures.setdefault(name, {})
+            for key, value in {**figures, **told}.items():
+                lists.setdefault(key, []).append(value)
+        self.before = (image, moment.references)
+
+    def rows(self, item: StudyScene | StudyExr) -> list[Row]:
+        return [
+            Row(
+                data=item.name,
+                variant=self.variant.name,
+                reference=reference,
+                figures=lists,
+                cpu_seconds=statistics.median(self.seconds) if self.seconds else None,
+                estimated=self.estimated,
+            )
+            for reference, lists in self.figures.items()
+        ]
+
+
+def _measure(
+    config: StudyConfig,
+    item: StudyScene | StudyExr,
+    variants: Sequence[StudyVariant],
+    folder: Path,
+    progress: Progress | None,
+) -> None:
+    runners = [_Runner(variant, make_filter(variant)) for variant in variants]
+    raw = tuple(v.samples for v in variants if v.filter is None and v.input == "stream")
+    stage = Stage(item.name, item.count, progress)
+    stage.step(0)
+    for moment in moments(item, raw):
+        masks = _masks(config, moment)
+        judges = {name: prepare_flip_ldr(image) for name, image in moment.references.items()}
+        shown = {f"reference {name}": image for name, image in moment.references.items()}
+        for runner in runners:
+            image, told = runner.image(moment)
+            runner.compare(moment, image, told, judges, masks)
+            shown[runner.variant.name] = image
+        if moment.index == item.shown:
+            for name, image in shown.items():
+                _show(picture_file(folder, item, name), image)
+        stage.step(moment.index + 1)
+    for runner in runners:
+        data = {"rows": [dataclasses.asdict(row) for row in runner.rows(item)]}
+        path = part_file(folder, config, item, runner.variant)
+        with output_file(path, overwrite=True) as temporary:
+            temporary.write_text(json.dumps(data), encoding="utf-8")
+
+
+def _masks(config: StudyConfig, moment: Moment) -> dict[str, Tensor]:
+    makers = {
+        "band": lambda: border_band(moment.sharp, moment.shutter),
+        "moving": lambda: moving_mask(moment),
+        "hidden": lambda: hidden_mask(moment),
+    }
+    return {name: makers[name]() for name in config.masks}
+
+
+def _frames(variant: StudyVariant, moment: Moment) -> tuple[Frame, ...]:
+    """Return what a filter is given."""
+    if variant.input == "stream":
+        return moment.samples[: variant.samples]
+    if variant.revealed == "none":
+        return (moment.sharp,)
+    return (dataclasses.replace(moment.sharp, revealed=moment.revealed),)
+
+
+def _told(layers: Mapping[str, Tensor]) -> dict[str, float | None]:
+    """Return figures that a filter tells of itself: the share of failed reprojections."""
+    if "reprojection" not in layers:
+        return {}
+    tried = int((layers["reprojection"] != 0).sum())
+    return {"failed": int((layers["reprojection"] < 0).sum()) / tried if tried else None}
+
+
+def _show(path: Path, image: Tensor) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_color(path, image, overwrite=True)
+
+
+# -- names and hashes ------------------------------------------------------------------------------
+
+
+def slug(name: str) -> str:
+    """Return a name as part of a file's name."""
+    return re.sub(r"[^\w.+=-]+", "-", name).strip("-")
+
+
+@functools.cache
+def _source_hash() -> str:
+    digest = hashlib.sha256()
+    root = Path(torchblur.__file__).parent
+    files = [*root.glob("*.py")]
+    for name in ("filters", "ops", "metrics", "render"):
+        files += (root / name).glob("*.py")
+    for file in sorted(files):
+        digest.update(file.read_bytes())
+    return digest.hexdigest()

@@ -1,0 +1,286 @@
+"""What a study is written to: JSON with every figure, tables, plots, and sheets of pictures."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+from collections.abc import Mapping, Sequence
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+from PIL import Image, ImageDraw, ImageFont
+
+from torchblur.errors import OutputError
+from torchblur.io.paths import output_file
+from tuning.study import Row, picture_file, slug
+from tuning.study_config import StudyConfig, StudyExr, StudyScene
+from tuning.study_figures import worth_of
+from tuning.study_plots import plot_samples, plot_time
+
+__all__ = ["check_study_outputs", "curve_of", "worth_table", "write_study"]
+
+_FILES = ("study.json", "tables.md", "tables.csv")
+_DIGITS = {"flip": 4, "psnr": 2, "ssim": 4, "temporal": 4, "failed": 3}
+_WORTH = {"flip": False, "psnr": True}  # whether more is better
+_LABEL_PX = 20
+_GAP_PX = 4
+_COLUMNS = 4
+_LEAST_WIDTH = 320  # px to which small pictures are enlarged
+
+NOTE = (
+    "Means over the frames. FLIP: less is better, on display values; median: FLIP's weighted "
+    "median. PSNR: dB, linear values, peak 1. SSIM: display values. “moving”, “band” …: over those "
+    "pixels alone. temporal: mean error of the change from the frame before, display values. failed: "
+    "share of failed reprojections among the tried ones. CPU s: median time of the filter per frame, of the process. Worth: so many raw "
+    "samples per pixel have the same FLIP or PSNR. ≈: estimated input."
+)
+
+
+def check_study_outputs(folder: Path, *, overwrite: bool = False) -> None:
+    """Refuse before the work what would be refused after it.
+
+    Raises:
+        OutputError: a result exists, or the folder cannot be made.
+    """
+    for name in _FILES:
+        if (folder / name).exists() and not overwrite:
+            raise OutputError(f"{folder / name} exists; overwrite=True (--overwrite) replaces it")
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise OutputError(f"cannot make the folder {folder}: {error.strerror}") from error
+
+
+def write_study(
+    folder: Path,
+    config: StudyConfig,
+    rows: Sequence[Row],
+    facts: Mapping[str, Mapping[str, float | None]] | None = None,
+    *,
+    overwrite: bool = False,
+) -> list[Path]:
+    """Write `study.json`, `tables.md`, `tables.csv`, plots, and a sheet of pictures per data.
+
+    Args:
+        folder: Where to.
+        config: The configuration.
+        rows: What `run_study` returned.
+        facts: Figures of the data themselves, by name of the data.
+        overwrite: Replace files that are there.
+
+    Raises:
+        OutputError: a file exists, or cannot be written.
+    """
+    check_study_outputs(folder, overwrite=overwrite)
+    files = [*_plots(folder, config, rows), *_sheets(folder, config, rows)]
+    texts = {
+        "study.json": _json(config, rows, facts or {}),
+        "tables.md": _markdown(config, rows, facts or {}),
+        "tables.csv": _csv(rows),
+    }
+    for name, text in texts.items():
+        with output_file(folder / name, overwrite=overwrite) as temporary:
+            temporary.write_text(text, encoding="utf-8")
+        files.append(folder / name)
+    return files
+
+
+def curve_of(
+    config: StudyConfig, rows: Sequence[Row], data: str, reference: str, figure: str
+) -> list[tuple[int, float]]:
+    """Return the figures of raw samples by their number, rising."""
+    samples = {
+        v.name: v.samples for v in config.variants if v.filter is None and v.input == "stream"
+    }
+    found = {
+        samples[row.variant]: row.mean(figure)
+        for row in rows
+        if (row.data, row.reference) == (data, reference) and row.variant in samples
+    }
+    return [(n, value) for n, value in sorted(found.items()) if value is not None]
+
+
+def worth_table(config: StudyConfig, rows: Sequence[Row]) -> dict[tuple[str, str, str], str]:
+    """Return what filters are worth, by data, reference, and "VARIANT FIGURE"."""
+    found = {}
+    for row in rows:
+        if row.variant not in config.worth:
+            continue
+        for metric, rising in _WORTH.items():
+            for figure in (metric, f"{metric}_moving"):
+                curve = curve_of(config, rows, row.data, row.reference, figure)
+                text = worth_of(row.mean(figure), curve, rising=rising)
+                if text:
+                    found[row.data, row.reference, f"{row.variant} {figure}"] = text
+    return found
+
+
+# -- tables ----------------------------------------------------------------------------------------
+
+
+def _json(
+    config: StudyConfig, rows: Sequence[Row], facts: Mapping[str, Mapping[str, float | None]]
+) -> str:
+    worth = worth_table(config, rows)
+    records: list[dict[str, Any]] = []
+    for row in rows:
+        own = {
+            key[2].rpartition(" ")[2]: text
+            for key, text in worth.items()
+            if key[:2] == (row.data, row.reference) and key[2].rpartition(" ")[0] == row.variant
+        }
+        records.append(
+            {
+                "data": row.data,
+                "variant": row.variant,
+                "reference": row.reference,
+                "estimated": row.estimated,
+                "means": {name: row.mean(name) for name in row.figures},
+                "worth": own,
+                "cpu_seconds": row.cpu_seconds,
+                "per_frame": dict(row.figures),
+            }
+        )
+    data = {
+        "title": config.title,
+        "torchblur": version("torchblur"),
+        "note": NOTE,
+        "facts": facts,
+        "rows": records,
+        "config": config.model_dump(mode="json"),
+    }
+    return json.dumps(data, indent=1, ensure_ascii=False) + "\n"
+
+
+def _csv(rows: Sequence[Row]) -> str:
+    names = list(dict.fromkeys(name for row in rows for name in row.figures))
+    buffer = io.StringIO()
+    writer = csv.writer(buffer, lineterminator="\n")
+    writer.writerow(["data", "reference", "variant", *names, "cpu_seconds"])
+    for row in rows:
+        values = [row.mean(name) for name in names]
+        cells = ["" if v is None else f"{v:.6g}" for v in (*values, row.cpu_seconds)]
+        writer.writerow([row.data, row.reference, row.variant, *cells])
+    return buffer.getvalue()
+
+
+def _markdown(
+    config: StudyConfig, rows: Sequence[Row], facts: Mapping[str, Mapping[str, float | None]]
+) -> str:
+    lines = [f"# {config.title}", "", NOTE, ""]
+    worth = worth_table(config, rows)
+    for data, reference in dict.fromkeys((row.data, row.reference) for row in rows):
+        some = [row for row in rows if (row.data, row.reference) == (data, reference)]
+        lines += [f"## {data}, {reference}", ""]
+        lines += _table(some, worth)
+        if data in facts:
+            lines += [_facts_line(facts[data]), ""]
+    return "\n".join(lines)
+
+
+def _table(rows: Sequence[Row], worth: Mapping[tuple[str, str, str], str]) -> list[str]:
+    names = list(dict.fromkeys(name for row in rows for name in row.figures))
+    names.sort(key=lambda name: "_" in name and name != "flip_median")  # the whole image first
+    columns = ["variant", *(_heading(name) for name in names), "worth FLIP", "worth PSNR", "CPU s"]
+    lines = [_line(columns), _line(["---", *["---:"] * (len(columns) - 1)])]
+    for row in rows:
+        key = (row.data, row.reference)
+        cells = [_text(row.mean(name), _DIGITS[name.partition("_")[0]]) for name in names]
+        cells += [worth.get((*key, f"{row.variant} {name}"), "") for name in _WORTH]
+        cells.append(_text(row.cpu_seconds, 3) if row.cpu_seconds is not None else "")
+        mark = "≈ " if row.estimated else ""
+        lines.append(_line([mark + row.variant, *cells]))
+    return [*lines, ""]
+
+
+def _heading(name: str) -> str:
+    metric, _, mask = name.partition("_")
+    shown = {"flip": "FLIP", "psnr": "PSNR", "ssim": "SSIM"}.get(metric, metric)
+    return f"{shown} {mask}".strip()
+
+
+def _facts_line(facts: Mapping[str, float | None]) -> str:
+    return "; ".join(f"{name} {_text(value, 4)}" for name, value in facts.items())
+
+
+def _text(value: float | None, digits: int) -> str:
+    return "–" if value is None else f"{value:.{digits}f}"
+
+
+def _line(values: Sequence[str]) -> str:
+    return "| " + " | ".join(value.replace("|", "\\|") for value in values) + " |"
+
+
+# -- plots and pictures ----------------------------------------------------------------------------
+
+
+def _plots(folder: Path, config: StudyConfig, rows: Sequence[Row]) -> list[Path]:
+    (folder / "plots").mkdir(exist_ok=True)
+    files = []
+    for data, reference in dict.fromkeys((row.data, row.reference) for row in rows):
+        some = {row.variant: row for row in rows if (row.data, row.reference) == (data, reference)}
+        stem = f"{slug(data)}.{slug(reference)}"
+        for plot in config.plots:
+            drawn = [some[name] for name in plot.variants if name in some]
+            if drawn and len(drawn[0].figures["flip"]) > 1:
+                path = folder / "plots" / f"{stem}.{plot.name}.png"
+                plot_time(path, _title(plot.title or plot.name, data, reference), drawn)
+                files.append(path)
+        for figure, label in (("flip", "mean FLIP"), ("psnr", "PSNR, dB")):
+            curve = curve_of(config, rows, data, reference, figure)
+            means = {name: some[name].mean(figure) for name in config.worth if name in some}
+            levels = {name: value for name, value in means.items() if value is not None}
+            if len(curve) > 1 and levels:
+                path = folder / "plots" / f"{stem}.worth-{figure}.png"
+                plot_samples(path, _title("worth", data, reference), curve, levels, label)
+                files.append(path)
+    return files
+
+
+def _title(what: str, data: str, reference: str) -> str:
+    return f"{what}: {data} (reference: {reference})"
+
+
+def _sheets(folder: Path, config: StudyConfig, rows: Sequence[Row]) -> list[Path]:
+    """Lay the pictures of each data beside each other, with the FLIP of the frame shown."""
+    files = []
+    for item in config.data:
+        references = list(dict.fromkeys(row.reference for row in rows if row.data == item.name))
+        pictures = [
+            (f"reference {n}", picture_file(folder, item, f"reference {n}")) for n in references
+        ]
+        for row in rows:
+            shown = not config.pictures or row.variant in config.pictures
+            if row.data == item.name and row.reference == references[0] and shown:
+                label = _label(row, item)
+                pictures.append((label, picture_file(folder, item, row.variant)))
+        if pictures and all(path.is_file() for _, path in pictures):
+            path = folder / "pictures" / f"{slug(item.name)}.png"
+            sheet = _sheet(pictures)
+            with output_file(path, overwrite=True) as temporary:
+                sheet.save(temporary, format="PNG")
+            files.append(path)
+    return files
+
+
+def _label(row: Row, item: StudyScene | StudyExr) -> str:
+    value = row.figures["flip"][item.shown]
+    return f"{row.variant} · FLIP {_text(value, 4)}"
+
+
+def _sheet(pictures: Sequence[tuple[str, Path]]) -> Image.Image:
+    images = [Image.open(path).convert("RGB") for _, path in pictures]
+    factor = max(1, round(_LEAST_WIDTH / images[0].width))
+    size = (images[0].width * factor, images[0].height * factor)
+    columns = min(_COLUMNS, len(images))
+    lines = -(-len(images) // columns)
+    cell = (size[0] + _GAP_PX, size[1] + _GAP_PX + _LABEL_PX)
+    page = Image.new("RGB", (columns * cell[0] - _GAP_PX, lines * cell[1] - _GAP_PX), "white")
+    draw = ImageDraw.Draw(page)
+    for index, ((label, _), image) in enumerate(zip(pictures, images, strict=True)):
+        left, top = index % columns * cell[0], index // columns * cell[1]
+        page.paste(image.resize(size, Image.Resampling.NEAREST), (left, top + _LABEL_PX))
+        draw.text((left + 2, top + 2), label, "black", ImageFont.load_default(13))
+    return page
