@@ -20,7 +20,7 @@ from torchblur.frame import Frame, Shutter
 from torchblur.render.compiling import Engine, check_engine
 from torchblur.render.sampling import spread_positions
 from torchblur.render.scene import Scene
-from torchblur.render.stream import StreamTracer, random_planes
+from torchblur.render.stream import random_planes, trace_stream
 from torchblur.render.surface import pixel_centers, surface_layers
 from torchblur.render.trace import CHUNK, Tracer
 
@@ -154,13 +154,14 @@ class Renderer:
         _check(size, 1, "spp", frame)
         if not _is_count(sample + 1):
             raise ConfigError(f"`sample` must be an integer of at least 0, got {sample!r}")
-        tracer = StreamTracer(
-            self.scene, frame, device=self.device, compiled=self._compiles(size, 1)
+        compiled = self._compiles(size, 1)
+        tracer = Tracer(
+            self.scene, frame, dtype=torch.float64, device=self.device, compiled=compiled
         )
-        planes = (3 if jitter else 1, size[0] * size[1])
-        time, *shift = random_planes(seed, frame, sample, planes)
-        moved = torch.stack(shift).double() - 0.5 if jitter else None
-        return tracer.frame(size, shutter or Shutter(1.0), time, moved)
+        shape = (3 if jitter else 1, size[0] * size[1])
+        planes = random_planes(seed, frame, sample, shape).to(self.device)
+        shift = planes[1:].double() - 0.5 if jitter else None
+        return trace_stream(tracer, size, shutter or Shutter(1.0), planes[0], shift)
 
     def _compiles(self, size: tuple[int, int], spp: int) -> bool:
         work = size[0] * size[1] * spp * self._num_bodies

@@ -33,6 +33,7 @@ def surface_layers(
     times: Tensor,
     *,
     acceleration: bool = False,
+    radiance: bool = False,
 ) -> dict[str, Tensor]:
     """Return what the camera sees at points of the image, each at its own time.
 
@@ -43,13 +44,14 @@ def surface_layers(
         y: Position in the image, px down, (N,).
         times: Frames after the tracer's frame, (N,).
         acceleration: Whether to compute the second derivative, too.
+        radiance: Whether to shade what is seen, too.
 
     Returns:
         `depth` (N,), `normal` (3, N), `object_id` (N,), `velocity` (2, N) in px/frame, and, if
-        asked for, `acceleration` (2, N) in px/frame².
+        asked for, `acceleration` (2, N) in px/frame², or `color` and `albedo`, (3, N) each.
     """
     parts = [
-        _layers_of_chunk(tracer, size, planes, acceleration)
+        _layers_of_chunk(tracer, size, planes, acceleration, radiance)
         for planes in zip(*(plane.split(CHUNK) for plane in (x, y, times)), strict=True)
     ]
     return {name: torch.cat([part[name] for part in parts], -1) for name in parts[0]}
@@ -104,7 +106,11 @@ def path_motion(
 
 
 def _layers_of_chunk(
-    tracer: Tracer, size: tuple[int, int], planes: tuple[Tensor, ...], acceleration: bool
+    tracer: Tracer,
+    size: tuple[int, int],
+    planes: tuple[Tensor, ...],
+    acceleration: bool,
+    radiance: bool,
 ) -> dict[str, Tensor]:
     x, y, times = planes
     rays = tracer.rays(size, x, y, times)
@@ -117,7 +123,12 @@ def _layers_of_chunk(
         "object_id": tracer.object_ids[hit.body.long()],
         "velocity": velocity,
     }
-    return layers if change is None else layers | {"acceleration": change}
+    if change is not None:
+        layers["acceleration"] = change
+    if radiance:
+        layers["color"] = tracer.radiance(hit)
+        layers["albedo"] = tracer.radiance(hit, lit=False)
+    return layers
 
 
 def _planes(vectors: Tensor) -> Vec:
