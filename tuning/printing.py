@@ -43,6 +43,7 @@ __all__ = [
 
 _WIDE = 150
 _SCORES = ("flip", "psnr", "ssim", "flip_band", "psnr_band", "ssim_band")
+_OF_SEQUENCES = ("flip", "flip_median", "psnr", "ssim", "temporal", "flip_band")
 _BOUNDS = ("ceiling", "noise")
 _CLAIM_COLUMNS = (
     "claim",
@@ -53,7 +54,7 @@ _CLAIM_COLUMNS = (
     "time\non/off",
 )
 _TONES = {"shows": "green", "does not show": "red", "mixed": "yellow"}
-_SHOWN = ("sharp", "line", "default", "start", "tuned", "ceiling", "noise")
+_SHOWN = ("sharp", "input", "line", "default", "start", "tuned", "ceiling", "noise")
 
 
 # -- parameters --------------------------------------------------------------------------------
@@ -246,7 +247,8 @@ def print_fit(result: FitResult, folder: Path) -> None:
 
 
 def _means(result: FitResult, variant: str, split: str) -> dict[str, float]:
-    means = {key: result.mean(variant, split, key) for key in _SCORES}
+    keys = _OF_SEQUENCES if any(score.frames for score in result.scores) else _SCORES
+    means = {key: result.mean(variant, split, key) for key in keys}
     return {key: float("nan") if value is None else value for key, value in means.items()}
 
 

@@ -33,8 +33,8 @@ _METRICS = {
     "ssim_band": Column(name="SSIM, borders", digits=4, better="high"),
 }
 _OF_SEQUENCES = {
-    "flip_median": Column(name="FLIP, weighted median", digits=4, better="low"),
-    "temporal": Column(name="change between frames", digits=4, better="low"),
+    "flip_median": Column(name="FLIP, median", digits=4, better="low"),
+    "temporal": Column(name="change in time", digits=4, better="low"),
 }
 _NOTES = {
     "sharp": "no filter",
