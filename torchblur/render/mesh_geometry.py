@@ -141,7 +141,7 @@ def areas(corners: Tensor) -> Tensor:
 
 
 def smooth_normals(corners: Tensor) -> Tensor:
-    """Return normals that are smooth over all edges, weighted by area, (F, 3, 3).
+    """Return normals that are smooth over all edges, weighted by angle, (F, 3, 3).
 
     Corners at one place share a normal, also where a file has them apart (at texture seams).
     """
@@ -151,8 +151,18 @@ def smooth_normals(corners: Tensor) -> Tensor:
     _, where = np.unique(cells, axis=0, return_inverse=True)
     index = torch.from_numpy(where.reshape(-1))
     sums = torch.zeros((int(index.max()) + 1, 3), dtype=corners.dtype)
-    sums.index_add_(0, index, _cross(corners).repeat_interleave(3, 0))
-    return torch.nn.functional.normalize(sums[index], dim=1, eps=1e-30).reshape(-1, 3, 3)
+    flat = torch.nn.functional.normalize(_cross(corners), dim=1, eps=1e-30)
+    sums.index_add_(0, index, (flat[:, None] * _angles(corners)[..., None]).reshape(-1, 3))
+    mean = sums[index].reshape(-1, 3, 3)
+    length = mean.norm(dim=2, keepdim=True)
+    return torch.where(length > 1e-6, mean / length.clamp(min=1e-6), flat[:, None])
+
+
+def _angles(corners: Tensor) -> Tensor:
+    """Return the angles of triangles at their corners, radians, (F, 3)."""
+    after, before = (corners.roll(shift, 1) - corners for shift in (-1, 1))
+    cosine = torch.nn.functional.cosine_similarity(after, before, dim=2, eps=1e-30)
+    return cosine.clamp(-1, 1).acos()
 
 
 def _cross(corners: Tensor) -> Tensor:
