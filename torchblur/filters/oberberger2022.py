@@ -116,10 +116,11 @@ class Oberberger2022Blur(TemporalBlur):
         if points.number == 0:
             return _untouched(scene, input_color), _remember(scene, None, past.frames)
         shots[:] = [_prefiltered(scene, i, past.frames) for i in range(len(shots))]
-        sums = _first_stage(scene)
-        sums, outcome = _accumulate(scene, sums, past)
+        first = _first_stage(scene)
+        sums, outcome = _accumulate(scene, first, past)
         second, valid = _second_stage(scene, sums)
-        color, blend = _compose(scene, sums, second, valid, take(input_color, points))
+        blend = _blend(scene, first, sums)
+        color = _compose(sums, second, valid, blend, take(input_color, points))
         planes = {
             "mean_length": scene.guide.length,
             "mean_angle": scene.guide.angle,
@@ -381,21 +382,23 @@ def _second_stage(scene: _Scene, sums: Sums) -> tuple[Tensor, Tensor]:
     return moving, valid
 
 
-def _compose(
-    scene: _Scene, sums: Sums, second: Tensor, valid: Tensor, given: Tensor
-) -> tuple[Tensor, Tensor]:
-    """Return the moving channel over the static one, and the opacity it was given."""
-    values = scene.values
+def _blend(scene: _Scene, first: Sums, sums: Sums) -> Tensor:
+    """Return the opacity of the moving channel, (1, N)."""
+    share, values = scene.guide.share, scene.values
+    if values.blend_source == "variance":
+        return saturate(per_point(values.blend_gain, scene.points, share) * share)
+    chosen = sums if values.blend_source == "weights" else first
+    return _mean(chosen.moving_weight, chosen.moving_weight + chosen.static_weight)
+
+
+def _compose(sums: Sums, second: Tensor, valid: Tensor, blend: Tensor, given: Tensor) -> Tensor:
+    """Return the moving channel over the static one; where one is empty, the other."""
     moving = _modulated(second[:-3])
     static = _modulated(_mean(sums.static, sums.static_weight))
-    if values.blend_source == "weights":
-        blend = _mean(sums.moving_weight, sums.moving_weight + sums.static_weight)
-    else:
-        blend = saturate(per_point(values.blend_gain, scene.points, given) * scene.guide.share)
     some, still = valid > 0, sums.static_weight > 0
     both = torch.lerp(static, moving, blend.expand_as(moving))
     one = torch.where(some, moving, torch.where(still, static, given))
-    return torch.where(some & still, both, one), blend
+    return torch.where(some & still, both, one)
 
 
 # -- memory ----------------------------------------------------------------------------------------

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import torch
 from torch import Tensor
 
 from torchblur.frame import Frame
 
-__all__ = ["constant_motion", "moving_square", "random_frame"]
+__all__ = ["as_stream", "constant_motion", "moving_square", "random_frame"]
 
 
 def random_frame(
@@ -89,3 +91,21 @@ def moving_square(
     wobble = torch.randn(motion.shape, generator=generator, dtype=dtype)
     grain = torch.rand(1, 1, height, width, generator=generator, dtype=dtype)
     return Frame(color=color, velocity=motion + 0.7 * wobble, depth=plane(*depths) + 0.3 * grain)
+
+
+def as_stream(frame: Frame, seed: int = 0) -> Frame:
+    """Return a frame with a random time for each pixel, and a random albedo.
+
+    Its color stays what it was: noise, not what a moving texture would show at these times. An
+    eighth of the albedo is nearly black.
+
+    Args:
+        frame: Any frame.
+        seed: Other times for another seed.
+    """
+    generator = torch.Generator().manual_seed(seed)
+    batch, _, height, width = frame.color.shape
+    drawn = torch.rand(batch, 5, height, width, generator=generator, dtype=torch.float64)
+    drawn = drawn.to(frame.dtype)
+    albedo = torch.where(drawn[:, 4:] < 1 / 8, 1e-3, 0.2 + 0.8 * drawn[:, 1:4])
+    return dataclasses.replace(frame, time=drawn[:, :1], albedo=albedo)
