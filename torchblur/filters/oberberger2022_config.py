@@ -63,7 +63,7 @@ class Oberberger2022Config(FilterConfig):
     )] = "px"
     blend_source: Annotated[Literal["variance", "weights", "first_stage"], Param(
         grad="discrete", source=f"{_unstated(_VARIANCE)}; others: {_OURS}",
-        meaning="opacity of moving: its share of the window, or of weights, with or without history",
+        meaning="opacity of moving: its share of the window, or of weights with or without history",
     )] = "variance"
     blend_gain: Annotated[float, Param(
         low=0.1, high=10.0, scale="log", grad="smooth", source=_unstated(_VARIANCE),
