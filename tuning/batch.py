@@ -1,29 +1,27 @@
 """Batch runs: one filter over many frames, on a few threads, to be stopped and gone on with.
 
-While one frame is filtered the next ones are read. Each result appears whole or not at all and
-says in its metadata what it was made with, so that a second run does only what is missing.
+While one frame is filtered the next ones are read; a filter with a memory takes the frames of a
+shot in order. Each result appears whole or not at all and says in its metadata what it was made
+with, so that a second run does only what is missing.
 """
 
 from __future__ import annotations
 
-import os
 import re
 import threading
-from collections.abc import Iterable, Mapping, Sequence
-from concurrent.futures import FIRST_COMPLETED, CancelledError, Future, ThreadPoolExecutor, wait
+from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import torch
 from pydantic import Field
 
 from torchblur.errors import ConfigError, OutputError
-from torchblur.filters import BlurFilter
-from torchblur.frame import Frame
+from torchblur.filters.base import TemporalBlur
 from torchblur.io import load_yaml
 from torchblur.params import build
-from tuning.apply import FilterSettings, blur_frame, make_filter, read_job, recipe_of, write_job
+from tuning.apply import FilterSettings, make_filter, recipe_of, samples_beside
 from tuning.config import apply_overrides
 from tuning.outputs import (
     Job,
@@ -32,12 +30,15 @@ from tuning.outputs import (
     find_inputs,
     make_folders,
     name_outputs,
+    newest_of,
     number_of,
     numbered,
     remove_leftovers,
     state_of,
 )
 from tuning.progress import Progress, Stage
+from tuning.runner import Runner, Task, cores
+from tuning.shots import shots_of
 
 __all__ = [
     "BatchConfig",
@@ -63,7 +64,9 @@ class BatchConfig(FilterSettings):
     gbuffer: str | None = Field(
         None, description="file beside each input with its layers; #### is its frame number, if any"
     )
-    workers: int = Field(1, ge=1, le=256, description="frames that are filtered at a time")
+    workers: int = Field(
+        1, ge=1, le=256, description="frames (with a memory: shots) that are filtered at a time"
+    )
     prefetch: int = Field(2, ge=0, le=64, description="frames that are read ahead")
 
 
@@ -76,12 +79,14 @@ class Plan:
         recipe: What goes into the metadata of each result.
         states: Each job, and whether it is done.
         overwrite: Make all results anew.
+        in_order: Whether the filter has a memory: frames are filtered in order, shot by shot.
     """
 
     config: BatchConfig
     recipe: Mapping[str, Any]
     states: tuple[tuple[Job, State], ...]
     overwrite: bool = False
+    in_order: bool = False
 
     @property
     def todo(self) -> list[Job]:
@@ -171,9 +176,16 @@ def plan_batch(config: BatchConfig, *, overwrite: bool = False) -> Plan:
     """
     root = Path(config.root)
     pairs = drop_results(name_outputs(find_inputs(config.inputs, root), config.output, root))
-    recipe = recipe_of(config, make_filter(config), config.gbuffer is not None)
-    jobs = [Job(source, output, _gbuffer_of(source, config)) for source, output in pairs]
-    with ThreadPoolExecutor(_cores()) as pool:
+    blur = make_filter(config)
+    recipe = recipe_of(config, blur, config.gbuffer is not None)
+    jobs = [
+        Job(source, output, _gbuffer_of(source, config), samples_beside(source, config))
+        for source, output in pairs
+    ]
+    if isinstance(blur, TemporalBlur):
+        found = _shot_states(shots_of(jobs, config.cuts), recipe)
+        return Plan(config, recipe, tuple(found), overwrite, in_order=True)
+    with ThreadPoolExecutor(cores()) as pool:
         states = list(pool.map(lambda job: state_of(job.output, job.sources, recipe), jobs))
     return Plan(config, recipe, tuple(zip(jobs, states, strict=True)), overwrite)
 
@@ -181,8 +193,13 @@ def plan_batch(config: BatchConfig, *, overwrite: bool = False) -> Plan:
 def run_batch(plan: Plan, progress: Progress | None = None) -> BatchResult:
     """Make all results of a plan that are not done; go on past frames that fail.
 
-    The result is the same for any number of workers. On KeyboardInterrupt the frames that are
-    being filtered are finished and written; a second one drops them.
+    The result is the same for any number of workers, and for a run that was stopped and started
+    again. A filter with a memory takes the frames of a shot in order, on one worker: a shot that
+    was left in its middle is filtered again from its first frame on, and only what is missing is
+    written. After a frame that fails the rest of its shot is not made.
+
+    On KeyboardInterrupt the frames that are being filtered are finished and written; a second one
+    drops them.
 
     Args:
         plan: What `plan_batch` returned.
@@ -203,125 +220,77 @@ def run_batch(plan: Plan, progress: Progress | None = None) -> BatchResult:
     stage = Stage("batch", len(jobs), progress)
     stage.step(0)
     log = _Log(result, stage)
-    stopped = _Runner(plan, log).run(jobs)
+    runner = Runner(
+        make_filter(plan.config),
+        plan.config,
+        plan.recipe,
+        workers=plan.config.workers,
+        prefetch=plan.config.prefetch,
+        log=log,
+    )
+    stopped = runner.run(_tasks(plan))
     result.interrupted = stopped and len(result.written) + len(result.failures) < len(jobs)
     return result
 
 
 class _Log:
-    """Writes down what becomes of each job, and tells the progress."""
+    """Writes down what becomes of each job, and tells the progress; from any thread."""
 
     def __init__(self, result: BatchResult, stage: Stage) -> None:
         self._result, self._stage = result, stage
+        self._turn = threading.Lock()
 
-    def record(self, job: Job, future: Future[None]) -> None:
-        reason = _reason(future)
-        if reason is None:
+    def written(self, job: Job) -> None:
+        with self._turn:
             self._result.written.append(job.output)
-        else:
+            self._tell(job.output.name)
+
+    def failed(self, job: Job, reason: str) -> None:
+        with self._turn:
             self._result.failures.append(Failure(job, reason))
-        failed = len(self._result.failures)
-        self._tell(f"{failed} failed" if failed else job.output.name)
+            self._tell(job.output.name)
 
     def stopping(self, count: int) -> None:
-        self._tell(f"stopping: {count} frames in flight are finished; Ctrl-C again drops them")
+        with self._turn:
+            text = f"stopping: {count} frames in flight are finished; Ctrl-C again drops them"
+            self._tell(text, is_last=True)
 
-    def _tell(self, message: str) -> None:
+    def _tell(self, message: str, *, is_last: bool = False) -> None:
         done = len(self._result.written) + len(self._result.failures)
-        self._stage.step(done, message=message)
+        failed = len(self._result.failures)
+        self._stage.step(done, message=f"{failed} failed" if failed and not is_last else message)
 
 
-class _Runner:
-    """Two pools of threads: one reads ahead, one filters and writes."""
-
-    def __init__(self, plan: Plan, log: _Log) -> None:
-        self._plan, self._log = plan, log
-        self._config = plan.config
-        self._blur: BlurFilter = make_filter(plan.config)
-        self._dropped = threading.Event()
-        # torch.compile is not made for several threads: they take turns, with all cores each.
-        self._turn = threading.Lock() if plan.config.engine == "compiled" else None
-
-    def run(self, jobs: Iterable[Job]) -> bool:
-        """Run the jobs; return whether the user stopped them."""
-        threads = torch.get_num_threads()
-        share = 1 if self._turn else self._config.workers
-        torch.set_num_threads(min(threads, max(1, _cores() // share)))
-        workers = ThreadPoolExecutor(
-            self._config.workers, "blur", torch.set_num_threads, (torch.get_num_threads(),)
-        )
-        readers = ThreadPoolExecutor(max(1, self._config.workers), "read")
-        running: dict[Future[None], Job] = {}
-        try:
-            self._feed(jobs, workers, readers, running)
-            return False
-        except KeyboardInterrupt:
-            readers.shutdown(wait=False, cancel_futures=True)
-            workers.shutdown(wait=False, cancel_futures=True)
-            self._finish(running)
-            return True
-        finally:
-            readers.shutdown(cancel_futures=True)
-            workers.shutdown(cancel_futures=True)
-            torch.set_num_threads(threads)
-
-    def _feed(
-        self,
-        jobs: Iterable[Job],
-        workers: ThreadPoolExecutor,
-        readers: ThreadPoolExecutor,
-        running: dict[Future[None], Job],
-    ) -> None:
-        limit = self._config.workers + self._config.prefetch
-        for job in jobs:
-            frame = readers.submit(read_job, job, self._config)
-            running[workers.submit(self._make, job, frame)] = job
-            while len(running) >= limit:
-                self._collect(running)
-        while running:
-            self._collect(running)
-
-    def _finish(self, running: dict[Future[None], Job]) -> None:
-        """Wait for the frames in flight; those whose turn did not come are dropped."""
-        for future in [f for f in running if f.cancelled()]:
-            del running[future]
-        self._log.stopping(len(running))
-        while running:
-            try:
-                self._collect(running)
-            except KeyboardInterrupt:
-                self._dropped.set()
-
-    def _collect(self, running: dict[Future[None], Job]) -> None:
-        finished, _ = wait(running, return_when=FIRST_COMPLETED)
-        for future in finished:
-            job = running.pop(future)
-            if not _was_dropped(future):
-                self._log.record(job, future)
-
-    def _make(self, job: Job, reading: Future[Frame]) -> None:
-        frame = reading.result()
-        if self._turn is None:
-            color, layers = blur_frame(self._blur, frame, self._config.layers)
-        else:
-            with self._turn:
-                color, layers = blur_frame(self._blur, frame, self._config.layers)
-        if self._dropped.is_set():
-            raise CancelledError
-        write_job(
-            job, color, layers, settings=self._config, recipe=self._plan.recipe, overwrite=True
-        )
+def _shot_states(
+    shots: Sequence[Sequence[Job]], recipe: Mapping[str, Any]
+) -> list[tuple[Job, State]]:
+    """Return the state of each frame: one is as old as the oldest that it follows."""
+    names = [(job, shot[0].source.name) for shot in shots for job in shot]
+    with ThreadPoolExecutor(cores()) as pool:
+        found = pool.map(lambda e: state_of(e[0].output, e[0].sources, recipe, e[1]), names)
+        states = dict(zip([job for job, _ in names], found, strict=True))
+    for shot in shots:
+        newest = 0.0
+        for job in shot:
+            newest = max(newest, newest_of(job.sources))
+            if states[job] == "done" and newest > job.output.stat().st_mtime:
+                states[job] = "out of date"
+    return list(states.items())
 
 
-def _was_dropped(future: Future[None]) -> bool:
-    return future.cancelled() or isinstance(future.exception(), CancelledError)
-
-
-def _reason(future: Future[None]) -> str | None:
-    error = future.exception()
-    if error is None:
-        return None
-    return str(error) if isinstance(error, ValueError) else f"{type(error).__name__}: {error}"
+def _tasks(plan: Plan) -> list[Task]:
+    """Return what is to be done: frames, or shots up to the last frame that is missing."""
+    todo = plan.todo
+    if not plan.in_order:
+        return [Task([job], [job]) for job in todo]
+    wanted = frozenset(todo)
+    tasks = []
+    for shot in shots_of([job for job, _ in plan.states], plan.config.cuts):
+        missing = [index for index, job in enumerate(shot) if job in wanted]
+        if missing:
+            jobs = shot[: missing[-1] + 1]
+            tasks.append(Task(jobs, wanted, shot=shot[0].source.name))
+    return tasks
 
 
 def _gbuffer_of(source: Path, config: BatchConfig) -> Path | None:
@@ -331,8 +300,3 @@ def _gbuffer_of(source: Path, config: BatchConfig) -> Path | None:
     if number_of(source) is None:
         name = re.sub(r"[._-]?#+", "", name)
     return source.parent / numbered(name, source)
-
-
-def _cores() -> int:
-    """Number of cores that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

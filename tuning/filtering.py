@@ -2,41 +2,35 @@
 
 from __future__ import annotations
 
-import math
-import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import torch
 from torch import Tensor
 
 from torchblur.errors import ConfigError, FrameError, OutputError
 from torchblur.filters import BlurFilter
+from torchblur.filters.base import TemporalBlur
 from torchblur.frame import Frame
-from torchblur.metrics import border_band, evaluate
 from torchblur.params import build
-from torchblur.presets import create_filter
-from tuning.apply import FilterSettings, blur_frame, make_filter, read_job, recipe_of, write_job
+from tuning.apply import (
+    FilterSettings,
+    blur_frame,
+    blur_step,
+    make_filter,
+    read_samples,
+    recipe_of,
+    samples_beside,
+    write_job,
+)
 from tuning.config import apply_overrides
 from tuning.images import read_color
+from tuning.judging import Scores, SequenceJudge, asked_name, judge, mean_scores
 from tuning.outputs import Job, find_inputs, make_folders, name_outputs, numbered
 from tuning.progress import Progress, Stage
+from tuning.shots import shots_of
 
-__all__ = [
-    "BASELINES",
-    "FileJob",
-    "Scores",
-    "asked_name",
-    "filter_files",
-    "judge",
-    "load_settings",
-    "mean_scores",
-    "plan_files",
-]
-
-BASELINES = ("line", "mcguire2012", "guertin2014")
-"""Filters that a result is compared with, at their papers' settings."""
+__all__ = ["FileJob", "filter_files", "load_settings", "plan_files"]
 
 _SETTINGS = FilterSettings.model_fields.keys() - {"filter", "params"}
 
@@ -49,19 +43,6 @@ class FileJob:
     output: Path | None
     gbuffer: Path | None
     reference: Path | None
-
-
-@dataclass(frozen=True)
-class Scores:
-    """How close filters come to the references, mean over the frames.
-
-    Args:
-        by_name: What `judge` returns.
-        asked: Name of the filter that was asked for.
-    """
-
-    by_name: Mapping[str, Mapping[str, float]]
-    asked: str
 
 
 def load_settings(name: str, overrides: Sequence[str], convention: str = "auto") -> FilterSettings:
@@ -141,6 +122,9 @@ def filter_files(
 ) -> Scores | None:
     """Filter files one after the other, and compare the results with their references.
 
+    A filter with a memory takes the frames of a shot in the order of their numbers; it forgets
+    where a number is missing, at the cuts of the settings, and where the size changes.
+
     Args:
         settings: Filter, parameters, convention.
         jobs: What `plan_files` returned.
@@ -156,19 +140,57 @@ def filter_files(
     blur = make_filter(settings)
     stage = Stage(blur.name, len(jobs), progress if len(jobs) > 1 else None)
     stage.step(0)
-    scores = []
-    for done, job in enumerate(jobs, start=1):
-        frame = read_job(Job(job.source, job.source, job.gbuffer), settings)
-        color, layers = blur_frame(blur, frame, settings.layers)
-        if job.reference is not None:
-            reference = _reference(job.reference, frame)
-            scores.append(judge(blur, frame, color, reference))
-        if job.output is not None:
-            recipe = recipe_of(settings, blur, job.gbuffer is not None)
-            named = Job(job.source, job.output, job.gbuffer)
-            write_job(named, color, layers, settings=settings, recipe=recipe, overwrite=overwrite)
-        stage.step(done, message=job.source.name)
+    scores: list[dict[str, dict[str, float]]] = []
+    count = 0
+    has_memory = isinstance(blur, TemporalBlur)
+    for shot in shots_of(jobs, settings.cuts) if has_memory else [[job] for job in jobs]:
+        first = shot[0].source.name if has_memory else None
+        found = _filter_shot(blur, shot, settings, shot_name=first, overwrite=overwrite)
+        for job, frame_scores in found:
+            scores += [] if frame_scores is None else [frame_scores]
+            count += 1
+            stage.step(count, message=job.source.name)
     return Scores(mean_scores(scores), asked_name(blur)) if scores else None
+
+
+def _filter_shot(
+    blur: BlurFilter,
+    shot: Sequence[FileJob],
+    settings: FilterSettings,
+    *,
+    shot_name: str | None,
+    overwrite: bool,
+) -> Iterator[tuple[FileJob, dict[str, dict[str, float]] | None]]:
+    """Filter files that follow each other; yield each with its comparison."""
+    history = None
+    sequence = SequenceJudge(blur)
+    recipe = recipe_of(settings, blur, shot[0].gbuffer is not None)
+    for job in shot:
+        more = samples_beside(job.source, settings)
+        named = Job(job.source, job.output or job.source, job.gbuffer, more)
+        samples = read_samples(named, settings)
+        if isinstance(blur, TemporalBlur):
+            color, layers, history = blur_step(blur, samples, history, settings.layers)
+        else:
+            color, layers = blur_frame(blur, samples[0], settings.layers)
+        scores = None
+        if job.reference is not None:
+            reference = _reference(job.reference, samples[0])
+            if history is None:
+                scores = judge(blur, samples[0], color, reference)
+            else:
+                scores = sequence.judge(samples, color, reference)
+        if job.output is not None:
+            write_job(
+                named,
+                color,
+                layers,
+                settings=settings,
+                recipe=recipe,
+                shot=shot_name,
+                overwrite=overwrite,
+            )
+        yield job, scores
 
 
 def _beside(key: str, pattern: str, source: Path, count: int) -> str:
@@ -188,73 +210,3 @@ def _reference(path: Path, frame: Frame) -> Tensor:
             f"{image.shape[-2]}, {frame.source} is {frame.size[1]}x{frame.size[0]}"
         )
     return image
-
-
-# -- evidence ----------------------------------------------------------------------------------
-
-
-@torch.no_grad()
-def judge(
-    blur: BlurFilter, frame: Frame, color: Tensor, reference: Tensor
-) -> dict[str, dict[str, float]]:
-    """Compare a result, the sharp frame and the baselines with a reference.
-
-    All filters get the shutter of the asked one; the rest of a baseline is its paper's.
-
-    Args:
-        blur: The filter that was asked for.
-        frame: The frame, batch size 1, on the CPU.
-        color: Its result, (1, 3, H, W).
-        reference: The frame with true motion blur, (1, 3, H, W).
-
-    Returns:
-        By name, what `evaluate` returns over the image and over "band", the pixels that moving
-        borders sweep. The asked filter stands under its name, with "(asked)" if it is a baseline
-        with other settings. A baseline that needs a layer which the frame lacks is left out, with
-        a warning.
-
-    Raises:
-        FrameError: sizes that differ.
-    """
-    band = {"band": border_band(frame, blur.shutter_setting)}
-    asked = asked_name(blur)
-    images = {"sharp": frame.color}
-    for name in BASELINES:
-        try:
-            images[name] = color if name == asked else _with_shutter_of(blur, name)(frame)
-        except FrameError as error:
-            warnings.warn(f"{name} is left out of the comparison: {error}", stacklevel=2)
-    images.setdefault(asked, color)
-    return {
-        name: {k: float(v) for k, v in evaluate(image, reference, masks=band).items()}
-        for name, image in images.items()
-    }
-
-
-def asked_name(blur: BlurFilter) -> str:
-    """Return the name under which `judge` lists the asked filter."""
-    is_plain = _with_shutter_of(blur, blur.name).config == blur.current_config()
-    return blur.name if is_plain or blur.name not in BASELINES else f"{blur.name} (asked)"
-
-
-def mean_scores(scores: Sequence[Mapping[str, Mapping[str, float]]]) -> dict[str, dict[str, float]]:
-    """Return the mean over frames of what `judge` returned; frames with an empty band don't count.
-
-    Args:
-        scores: One entry per frame; names that not all of them have are left out.
-    """
-    return {
-        name: {key: _mean([frame[name][key] for frame in scores]) for key in scores[0][name]}
-        for name in scores[0]
-        if all(name in frame for frame in scores)
-    }
-
-
-def _with_shutter_of(blur: BlurFilter, name: str) -> BlurFilter:
-    config = blur.config
-    return create_filter(name, shutter=config.shutter, shutter_position=config.shutter_position)
-
-
-def _mean(values: Sequence[float]) -> float:
-    known = [value for value in values if not math.isnan(value)]
-    return sum(known) / len(known) if known else math.nan

@@ -22,6 +22,7 @@ __all__ = [
     "made_by",
     "make_folders",
     "name_outputs",
+    "newest_of",
     "number_of",
     "numbered",
     "remove_leftovers",
@@ -47,16 +48,19 @@ class Job:
         source: The sharp frame.
         output: The image to be written.
         gbuffer: A second file with all layers but the color.
+        samples: Files with more samples of the same pixels.
     """
 
     source: Path
     output: Path
     gbuffer: Path | None = None
+    samples: tuple[Path, ...] = ()
 
     @property
     def sources(self) -> tuple[Path, ...]:
         """All files that are read."""
-        return (self.source,) if self.gbuffer is None else (self.source, self.gbuffer)
+        gbuffer = () if self.gbuffer is None else (self.gbuffer,)
+        return (self.source, *gbuffer, *self.samples)
 
 
 # -- inputs ------------------------------------------------------------------------------------
@@ -216,27 +220,33 @@ def _without_collisions(pairs: list[tuple[Path, Path]]) -> list[tuple[Path, Path
 # -- what is there already ---------------------------------------------------------------------
 
 
-def made_by(recipe: Mapping[str, Any], source: Path) -> dict[str, Any]:
+def made_by(recipe: Mapping[str, Any], source: Path, shot: str | None = None) -> dict[str, Any]:
     """Return the metadata of a result: what it was made with and from.
 
     Args:
         recipe: All settings that the pixels depend on, as plain data.
         source: The input.
+        shot: Name of the first frame of its shot, if the frames before it matter.
     """
-    return {"torchblur": version("torchblur"), "recipe": dict(recipe), "source": source.name}
+    made = {"torchblur": version("torchblur"), "recipe": dict(recipe), "source": source.name}
+    return made if shot is None else made | {"shot": shot}
 
 
-def state_of(output: Path, sources: Sequence[Path], recipe: Mapping[str, Any]) -> State:
+def state_of(
+    output: Path, sources: Sequence[Path], recipe: Mapping[str, Any], shot: str | None = None
+) -> State:
     """Return whether a result is still to be made.
 
     Args:
         output: Its file.
         sources: The files that it is made from.
         recipe: What `made_by` was given.
+        shot: The same.
 
     Returns:
         "to do": not there, or an image cut short. "done": made with this recipe, and newer
-        than its inputs. "out of date": made with this recipe from inputs that have changed since.
+        than its inputs. "out of date": made with this recipe from inputs that have changed since,
+        or with another beginning of its shot.
         "other": made with other settings or by another program; only the user may replace it.
     """
     if not output.exists():
@@ -247,9 +257,13 @@ def state_of(output: Path, sources: Sequence[Path], recipe: Mapping[str, Any]) -
         return "to do" if _begins_as_image(output) else "other"
     if found.get("recipe") != dict(recipe):
         return "other"
-    changed = output.stat().st_mtime
-    newest = max((path.stat().st_mtime for path in sources if path.exists()), default=0.0)
-    return "out of date" if newest > changed else "done"
+    is_older = newest_of(sources) > output.stat().st_mtime
+    return "out of date" if is_older or found.get("shot") != shot else "done"
+
+
+def newest_of(paths: Iterable[Path]) -> float:
+    """Return when the youngest of some files was changed; 0 if none is there."""
+    return max((path.stat().st_mtime for path in paths if path.exists()), default=0.0)
 
 
 def _begins_as_image(path: Path) -> bool:
