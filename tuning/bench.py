@@ -3,7 +3,7 @@
 ::
 
     python -m tuning.bench [--size 1280x720] [--samples 35] [--runs 3] [--json FILE]
-                           [--filters guertin2014 line] [--only speed memory notes]
+                           [--filters guertin2014 line] [--only speed memory notes moving]
 
 Figures are medians, each measurement in a process of its own. CPU-seconds are what to compare:
 on a machine that is not idle, wall time and multi-threaded CPU time are both inflated, and the
@@ -13,6 +13,7 @@ program says so.
 from __future__ import annotations
 
 import argparse
+import functools
 import json
 import os
 import resource
@@ -33,6 +34,9 @@ _KNOWN = {
 }
 """CPU-seconds per frame of other Guertin programs at 1280x720, N = 35, on two quiet cores."""
 
+_MOVING = (0, 10, 50, 100)
+"""Shares of the pixels that move, percent."""
+
 _NOTES_US = {("full", "two"): 490, ("full", "one"): 355, ("half", "two"): 225, ("half", "one"): 195}
 """Microseconds of the 2025 notes' own table."""
 
@@ -44,7 +48,7 @@ def main() -> None:
     parser.add_argument("--samples", type=int, default=35, help="taps N")
     parser.add_argument("--runs", type=int, default=3, help="timed runs of each")
     parser.add_argument("--filters", nargs="*", help="time these; all if left out")
-    parser.add_argument("--only", nargs="*", choices=("speed", "memory", "notes"))
+    parser.add_argument("--only", nargs="*", choices=("speed", "memory", "notes", "moving"))
     parser.add_argument("--json", type=Path, help="write the figures here too")
     parser.add_argument("--child", help=argparse.SUPPRESS)
     arguments = parser.parse_args()
@@ -58,6 +62,7 @@ def main() -> None:
         "speed": lambda: _speed(job | {"num_samples": arguments.samples}, arguments.filters),
         "memory": lambda: _memory(job, arguments.samples),
         "notes": lambda: _notes(job),
+        "moving": lambda: _moving(job, arguments.samples, arguments.filters),
     }
     chosen = arguments.only or tuple(tables)
     figures = {name: table() for name, table in tables.items() if name in chosen}
@@ -135,6 +140,29 @@ def _notes(job: dict[str, Any]) -> list[dict[str, Any]]:
     return rows
 
 
+def _moving(job: dict[str, Any], num_samples: int, names: list[str] | None) -> list[dict[str, Any]]:
+    """Time filters on frames of which a share moves, all in one process, in turns."""
+    print(f"\ntime by the share of moving pixels, eager, {job['width']}x{job['height']}")
+    chosen = names or ["oberberger2022", "guertin2014"]
+    print(
+        f"{'filter':<16}{'moving':>8}{'CPU s':>9}{'wall s':>9}"
+        f"{'of its 100 %':>14}{'of Guertin':>12}"
+    )
+    shared = {"what": "moving", "filters": chosen, "num_samples": num_samples}
+    rows: list[dict[str, Any]] = _child(job | shared)["rows"]
+    whole = {row["filter"]: row["cpu"] for row in rows if row["percent"] == 100}
+    for row in rows:
+        row["of_whole"] = row["cpu"] / whole[row["filter"]]
+        row["of_guertin"] = row["cpu"] / whole["guertin2014"] if "guertin2014" in whole else None
+        beside = "" if row["of_guertin"] is None else f"{row['of_guertin']:.2f}"
+        print(
+            f"{row['filter']:<16}{row['percent']:>6} %{row['cpu']:>9.3f}{row['wall']:>9.3f}"
+            f"{row['of_whole']:>14.2f}{beside:>12}"
+        )
+    print(f"of Guertin: over guertin2014 with N = {num_samples}, where all pixels move")
+    return rows
+
+
 def _filter_names() -> list[str]:
     """Return the registered filters, from a process that loads torch in this one's place."""
     code = "from torchblur.filters import registered_filters; print(*registered_filters())"
@@ -155,6 +183,8 @@ def _measure(job: dict[str, Any]) -> dict[str, Any]:
     from torchblur.filters import get_filter
     from torchblur.frame import Frame
 
+    if job["what"] == "moving":
+        return {"rows": _measure_moving(job)}
     generator = torch.Generator().manual_seed(0)
     size = (job["height"], job["width"])
     coarse = torch.randn(1, 2, 9, 16, generator=generator) * 20
@@ -193,6 +223,60 @@ def _measure(job: dict[str, Any]) -> dict[str, Any]:
         "backward_cpu": backward_cpu,
         "backward_wall": backward_wall,
     }
+
+
+def _measure_moving(job: dict[str, Any]) -> list[dict[str, Any]]:
+    import torch
+
+    from torchblur.filters import TemporalBlur, get_filter
+
+    calls: dict[tuple[str, int], Any] = {}
+    for name in job["filters"]:
+        samples = {"num_samples": job["num_samples"]} if name == "guertin2014" else {}
+        blur = get_filter(name)(**samples)
+        for percent in _MOVING:
+            frame = _moving_frame(job["height"], job["width"], percent)
+            with torch.no_grad():
+                # A frame in the middle of a sequence: the filter has a history.
+                history = blur.step(frame)[1] if isinstance(blur, TemporalBlur) else None
+                blur.layers(frame, **({} if history is None else {"history": history}))
+            calls[name, percent] = (blur, frame, history)
+
+    def call(key: tuple[str, int]) -> None:
+        blur, frame, history = calls[key]
+        with torch.no_grad():
+            blur.layers(frame, **({} if history is None else {"history": history}))
+
+    taken: dict[tuple[str, int], list[tuple[float, float]]] = {key: [] for key in calls}
+    for _ in range(job["runs"]):
+        for key in calls:
+            taken[key].append(_median(functools.partial(call, key), 1))
+    return [
+        {
+            "filter": name,
+            "percent": percent,
+            "cpu": statistics.median(cpu for cpu, _ in times),
+            "wall": statistics.median(wall for _, wall in times),
+        }
+        for (name, percent), times in taken.items()
+    ]
+
+
+def _moving_frame(height: int, width: int, percent: int) -> Any:
+    """Return a stream frame whose left `percent` of columns moves by 20 px, the rest is still."""
+    import torch
+
+    from torchblur.frame import Frame
+
+    generator = torch.Generator().manual_seed(0)
+    moves = (torch.arange(width) < round(width * percent / 100)).float().view(1, 1, 1, -1)
+    velocity = torch.tensor([40.0, 0.0]).view(1, 2, 1, 1) * moves.expand(1, 1, height, width)
+    return Frame(
+        color=torch.rand(1, 3, height, width, generator=generator),
+        velocity=velocity,
+        depth=torch.ones(1, 1, height, width),
+        time=torch.rand(1, 1, height, width, generator=generator),
+    )
 
 
 def _median(function: Any, runs: int) -> tuple[float, float]:

@@ -15,7 +15,7 @@ from torchblur.errors import ConfigError
 from torchblur.frame import Frame, Shutter
 from torchblur.io import read_frame, read_image
 from torchblur.params import build
-from torchblur.render import Scene, load_scene, render_frame, render_reference, render_stream
+from torchblur.render import Renderer, load_scene, render_revealed
 from torchblur.render.camera import Camera
 from tuning.frame_cache import cache_key, cached, frame_of, hash_scene, planes_of
 from tuning.numbering import numbered_file
@@ -23,6 +23,7 @@ from tuning.study_config import KEPT_SAMPLES, StudyExr, StudyScene
 
 __all__ = ["Moment", "identity_of", "moments"]
 
+_WORTH_COMPILING = 8  # frames
 _HIDDEN_SPP = 64  # times at which the true set of revealed pixels is sampled
 
 
@@ -119,45 +120,35 @@ def _hash_scene(path: str, _: int) -> str:
     return hash_scene(Path(path))
 
 
-def _scene(item: StudyScene) -> Scene:
+def _renderer(item: StudyScene) -> Renderer:
     scene = load_scene(item.path)
-    if not item.camera:
-        return scene
-    values = scene.camera.model_dump(exclude_unset=True) | item.camera
-    camera = build(Camera, values, f"data {item.name!r}: camera")
-    return scene.model_copy(update={"camera": camera})
+    if item.camera:
+        values = scene.camera.model_dump(exclude_unset=True) | item.camera
+        camera = build(Camera, values, f"data {item.name!r}: camera")
+        scene = scene.model_copy(update={"camera": camera})
+    return Renderer(scene, engine="compiled" if item.count >= _WORTH_COMPILING else "auto")
 
 
 def _render(item: StudyScene, time: float) -> dict[str, Tensor]:
-    scene, size, shutter = _scene(item), item.height_width, item.exposure
+    renderer, size, shutter = _renderer(item), item.height_width, item.exposure
     # Sharp color, stream and references must not share their noise.
-    sharp = render_frame(scene, size, frame=time, color_spp=item.color_spp, seed=item.seed)
+    sharp = renderer.frame(size, frame=time, color_spp=item.color_spp, seed=item.seed)
     tensors = planes_of(sharp, "sharp")
     for offset, name in enumerate(item.references, start=1):
-        reference = render_reference(
-            scene,
-            size,
-            spp=item.spp,
-            shutter=shutter,
-            frame=time,
-            seed=item.seed + offset,
-            pixel=name,
+        seed = item.seed + offset
+        reference = renderer.reference(
+            size, spp=item.spp, shutter=shutter, frame=time, seed=seed, pixel=name
         )
         tensors[f"reference.{name}"] = reference.mean
         tensors[f"variance.{name}"] = reference.variance
     if item.stream_spp:
-        tensors |= _stream(item, time)
-    return tensors | (_behind(item, time) if item.revealed else {})
+        tensors |= _stream(renderer, item, time)
+    return tensors | (_behind(renderer, item, time) if item.revealed else {})
 
 
-def _stream(item: StudyScene, time: float) -> dict[str, Tensor]:
-    frames = render_stream(
-        _scene(item),
-        item.height_width,
-        frame=time,
-        shutter=item.exposure,
-        spp=item.stream_spp,
-        seed=item.seed,
+def _stream(renderer: Renderer, item: StudyScene, time: float) -> dict[str, Tensor]:
+    frames = renderer.stream(
+        item.height_width, frame=time, shutter=item.exposure, spp=item.stream_spp, seed=item.seed
     )
     tensors: dict[str, Tensor] = {}
     total = torch.zeros_like(frames[0].color)
@@ -170,15 +161,13 @@ def _stream(item: StudyScene, time: float) -> dict[str, Tensor]:
     return tensors
 
 
-def _behind(item: StudyScene, time: float) -> dict[str, Tensor]:
+def _behind(renderer: Renderer, item: StudyScene, time: float) -> dict[str, Tensor]:
     """Return the revealed layer, and what each pixel's center sees over the shutter."""
-    from torchblur.render import render_revealed
-
-    scene, size = _scene(item), item.height_width
-    revealed = render_revealed(scene, size, frame=time, color_spp=item.revealed_spp, seed=item.seed)
-    seen = render_stream(
-        scene, size, frame=time, shutter=item.exposure, spp=_HIDDEN_SPP, seed=item.seed + 9
+    size, seed = item.height_width, item.seed
+    revealed = render_revealed(
+        renderer.scene, size, frame=time, color_spp=item.revealed_spp, seed=seed
     )
+    seen = renderer.stream(size, frame=time, shutter=item.exposure, spp=_HIDDEN_SPP, seed=seed + 9)
     tensors = planes_of(revealed.frame, "revealed")
     tensors["seen.object_id"] = torch.cat([_layer(frame, "object_id") for frame in seen])
     tensors["seen.depth"] = torch.cat([_layer(frame, "depth") for frame in seen])

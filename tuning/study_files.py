@@ -32,9 +32,10 @@ _LEAST_WIDTH = 320  # px to which small pictures are enlarged
 NOTE = (
     "Means over the frames. FLIP: less is better, on display values; median: FLIP's weighted "
     "median. PSNR: dB, linear values, peak 1. SSIM: display values. “moving”, “band” …: over those "
-    "pixels alone. temporal: mean error of the change from the frame before, display values. failed: "
-    "share of failed reprojections among the tried ones. CPU s: median time of the filter per frame, of the process. Worth: so many raw "
-    "samples per pixel have the same FLIP or PSNR. ≈: estimated input."
+    "pixels alone. temporal: mean error of the change from the frame before, display values. "
+    "failed: share of failed reprojections among those tried. CPU s: median time of the filter "
+    "per frame, of the process. Worth: so many raw samples per pixel have the same FLIP or PSNR. "
+    "≈: estimated input."
 )
 
 

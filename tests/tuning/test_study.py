@@ -171,7 +171,8 @@ class TestFiles:
 title: Files
 data:
   - {{name: f, kind: exr, path: {tmp_path}, first: 4, count: 3, sharp: center.####.exr,
-      shutter: 1.0, stream: stream.####.exr, references: {{truth: truth.####.exr}}, converged: truth}}
+      shutter: 1.0, stream: stream.####.exr, converged: truth,
+      references: {{truth: truth.####.exr}}}}
 variants:
   - {{name: 1 spp, input: stream}}
   - {{name: 4 spp, input: stream, samples: 4}}
@@ -187,7 +188,7 @@ variants:
         assert four.mean("psnr") - one.mean("psnr") == pytest.approx(20 * math.log10(2), abs=0.01)
 
     def test_without_what_they_converge_to_they_are_refused(self, folder):
-        edited(folder / "study.yaml", ", converged: truth", "")
+        edited(folder / "study.yaml", " converged: truth,", "")
         with pytest.raises(ConfigError, match=r"'4 spp' takes 4.*'f' has 1.*variants\.1\.samples"):
             load_study_config(folder / "study.yaml")
 
