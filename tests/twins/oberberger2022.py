@@ -62,8 +62,9 @@ def oberberger2022(frames, history=None, *, times=None, jitter=None, **changes):
     planes = {}
     for x, y in everywhere:
         motion, color = motions[y][x], tuple(colors[:, y, x])
-        outcome, channels = collected[x, y][2], (moving[y][x], static[y][x], filtered[y][x])
-        seen = look_at(motion, channels, outcome, color, settings)
+        channels = moving[y][x], static[y][x], filtered[y][x]
+        seen = look_at(motion, channels, collected[x, y][3], color, settings)
+        seen["reprojection"] = collected[x, y][2]
         seen["prefiltered"] = remodulated(values[0][y][x])
         for name, value in seen.items():
             shape = (np.size(value), rows, columns)
@@ -71,12 +72,12 @@ def oberberger2022(frames, history=None, *, times=None, jitter=None, **changes):
     return planes, history
 
 
-def look_at(motion, channels, outcome, color, settings):
+def look_at(motion, channels, first_weights, color, settings):
     """What is shown of one pixel; 0 where nothing moves nearby."""
     moving, static, filtered = channels
     if not motion.active:
         moving, static = Moving(), Still()
-    alpha = blend_factor(motion, moving.weight, static.weight, settings)
+    alpha = blend_factor(motion, (moving.weight, static.weight), first_weights, settings)
     black = (0.0, 0.0, 0.0)
     return {
         "color": compose(filtered, static, alpha, color) if motion.active else color,
@@ -89,20 +90,19 @@ def look_at(motion, channels, outcome, color, settings):
         "moving_weight": moving.weight,
         "static": remodulated(static.value or black),
         "static_weight": static.weight,
-        "reprojection": outcome,
         "second_stage": remodulated(filtered.value or black),
     }
 
 
 def collect(grids, values, p, motion, history, settings):
-    """(moving, static, outcome of the reprojection) at p: first stage and what history adds."""
+    """First stage and history at p: moving, static, outcome of the reprojection, first weights."""
     x, y = p
     own = grids[0][y][x]
     if not motion.active:
         value = np.mean([grid[y][x].value for grid in grids], axis=0)
-        return Moving(), Still(tuple(value), 1.0 if own.still else 0.0), 0
+        return Moving(), Still(tuple(value), 1.0 if own.still else 0.0), 0, (0.0, 0.0)
     moving, static = first_stage(grids, values, x, y, motion.c, settings)
-    outcome = 0
+    outcome, first_weights = 0, (moving.weight, static.weight)
     if history is not None:
         current = Moving.of(moving)
         if current.weight > 0:
@@ -112,7 +112,7 @@ def collect(grids, values, p, motion, history, settings):
         keeps_own = settings.static_filter == "own" and own.still
         add_static_history(static, history.static, p, keeps_own, settings)
     still = Still(static.mean(), static.weight) if static.weight > 0 else Still()
-    return Moving.of(moving), still, outcome
+    return Moving.of(moving), still, outcome, first_weights
 
 
 def remember(moving, static, settings):
@@ -361,11 +361,12 @@ def second_stage(channel, x, y, motion, i, settings):
 # -- composition -------------------------------------------------------------------------------
 
 
-def blend_factor(motion, moving_weight, static_weight, settings):
+def blend_factor(motion, weights, first_weights, settings):
+    """Opacity of the moving channel; weights: (moving, static), with history and without."""
     if settings.blend_source == "variance":
         return sat(settings.blend_gain * motion.moving_part)
-    total = moving_weight + static_weight
-    return moving_weight / total if total > 0 else 0.0
+    moving, static = weights if settings.blend_source == "weights" else first_weights
+    return moving / (moving + static) if moving + static > 0 else 0.0
 
 
 def compose(moving, static, alpha, color):

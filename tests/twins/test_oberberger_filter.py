@@ -25,7 +25,13 @@ CASES = [
     SMALL | {"first_stage": False, "static_filter": "own", "moving_threshold": 3.0},
     SMALL | {"cancel_threshold": 3.0, "accept_threshold": 2.5, "kernel_scaling": "fixed"},
     SMALL | {"temporal": False, "min_step": 0.0, "step_divisor": 2.0, "seed": 5},
-    SMALL | {"kernel_rotation": False, "second_stage_iterations": 2, "lookup": "bilinear"},
+    SMALL
+    | {
+        "blend_source": "first_stage",
+        "kernel_rotation": False,
+        "second_stage_iterations": 2,
+        "lookup": "bilinear",
+    },
     SMALL | {"demodulate": True, "albedo_floor": 0.1, "angle_normalization": 0.5},
 ]
 

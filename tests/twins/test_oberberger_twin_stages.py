@@ -176,9 +176,20 @@ def test_composition():
     assert ob.compose(moving, static, 0.25, (9, 9, 9)) == (2, 4, 6)
     static.weight = 0
     assert ob.compose(moving, static, 0.25, (9, 9, 9)) == (9, 9, 9)
+
+
+def test_opacity():
     motion = Motion(1.0, moving_part=0.3)
-    assert ob.blend_factor(motion, 1, 3, settings_of({"blend_gain": 2.0})) == pytest.approx(0.6)
-    assert ob.blend_factor(motion, 1, 3, settings_of({"blend_source": "weights"})) == 0.25
+    opacities = [
+        ob.blend_factor(motion, (1, 3), (2, 3), settings_of(changes))
+        for changes in (
+            {"blend_gain": 2.0},
+            {"blend_gain": 4.0},
+            {"blend_source": "weights"},
+            {"blend_source": "first_stage"},
+        )
+    ]
+    assert opacities == pytest.approx([0.6, 1, 0.25, 0.4])
 
 
 def test_nothing_moves(rng):
