@@ -304,8 +304,13 @@ def render(  # noqa: PLR0913 - each argument is an option
 
 @app.command()
 def compare(
-    images: Annotated[list[Path], typer.Argument(metavar="IMAGE", help="EXR or PNG files.")],
-    reference: Annotated[Path, typer.Option(metavar="REF", help="Image with true motion blur.")],
+    images: Annotated[
+        list[Path],
+        typer.Argument(metavar="IMAGE", help="EXR or PNG files, or sequences with ####."),
+    ],
+    reference: Annotated[
+        Path, typer.Option(metavar="REF", help="Image with true motion blur; #### for sequences.")
+    ],
     output: Annotated[
         Path | None,
         typer.Option("-o", "--output", metavar="HTML", help="Page with sliders and error maps."),
@@ -322,14 +327,22 @@ def compare(
     convention: ConventionName = "auto",
     overwrite: Overwrite = False,
 ) -> None:
-    """Measure how close images come to a reference: FLIP, PSNR and SSIM."""
+    """Measure how close images come to a reference: FLIP, PSNR and SSIM.
+
+    Sequences (`out/####.exr --reference reference.####.exr`): means over the frames, the weighted
+    median of FLIP, and the error of the change from frame to frame.
+    """
     from torchblur.frame import Shutter
     from tuning.compare import compare_images, write_page
+    from tuning.compare_sequences import compare_sequences, is_sequence
 
-    found = compare_images(
+    named = [*images, reference, *([] if frame is None else [frame])]
+    compared = compare_sequences if is_sequence(named) else compare_images
+    found = compared(
         images, reference, frame=frame, convention=convention, shutter=Shutter(shutter)
     )
-    results.print(metrics_table(f"against {reference}; PSNR in dB, linear", found.scores))
+    frames = f", mean of {found.frames}" if found.frames else ""
+    results.print(metrics_table(f"against {reference}{frames}; PSNR in dB, linear", found.scores))
     if output is not None:
         write_page(output, found, title=f"Against {reference.name}", overwrite=overwrite)
         results.print(f"page: {output}", soft_wrap=True)

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import torch
+from markupsafe import Markup
 from torch import Tensor
 
 from torchblur.errors import FrameError
@@ -18,29 +19,39 @@ from torchblur.metrics import border_band, evaluate
 from tuning.images import read_color
 from tuning.page import Column, Row, Table, make_view, render_page
 
-__all__ = ["Comparison", "compare_images", "short_names", "write_page"]
+__all__ = ["Comparison", "check_size", "compare_images", "short_names", "write_page"]
 
 _METRICS = (("flip", "FLIP", 4, "low"), ("psnr", "PSNR", 2, "high"), ("ssim", "SSIM", 4, "high"))
 _COLUMNS = {
     f"{key}{mask}": Column(name=f"{name}{label}", digits=digits, better=better)
     for mask, label in (("", ""), ("_band", ", borders"))
     for key, name, digits, better in _METRICS
+} | {
+    "flip_median": Column(name="FLIP, median", digits=4, better="low"),
+    "temporal": Column(name="change in time", digits=4, better="low"),
 }
 
 
 @dataclass(frozen=True, eq=False)
 class Comparison:
-    """Images beside their reference.
+    """Images beside their reference, or sequences beside theirs.
 
     Args:
-        reference: Scene-linear radiance, (1, 3, H, W).
+        reference: Scene-linear radiance, (1, 3, H, W); of a sequence that of the shown frame.
         images: The images by name, same shape.
-        scores: What `evaluate` returns, by image; with "band" if the sharp frame was given.
+        scores: What `evaluate` returns, by image; with "band" if the sharp frame was given. Of a
+            sequence the means over its frames, with "flip_median" and "temporal".
+        shown: What the images are.
+        frames: How many frames there are, in words; empty for single images.
+        curves: The figures of a sequence over its frames, as SVG.
     """
 
     reference: Tensor
     images: Mapping[str, Tensor]
     scores: Mapping[str, Mapping[str, float]]
+    shown: str = "Images"
+    frames: str = ""
+    curves: Markup | None = None
 
 
 @torch.no_grad()
@@ -76,7 +87,7 @@ def compare_images(
         files = {"sharp": frame} | files
         images = {"sharp": sharp.color} | images
     for name, image in images.items():
-        _check_size(image, files[name], target, reference)
+        check_size(image, files[name], target, reference)
     scores = {
         name: {k: float(v) for k, v in evaluate(image, target, masks=masks).items()}
         for name, image in images.items()
@@ -98,15 +109,17 @@ def write_page(path: Path, comparison: Comparison, *, title: str, overwrite: boo
     """
     height, width = comparison.reference.shape[-2:]
     has_band = any(key.endswith("_band") for row in comparison.scores.values() for key in row)
+    subtitle = f"{len(comparison.images)} images of {width}x{height} px"
     page = render_page(
         "compare.html",
         title=title,
-        subtitle=f"{len(comparison.images)} images of {width}x{height} px",
+        subtitle=subtitle if not comparison.frames else f"{subtitle}, {comparison.frames}",
         table=_table(comparison.scores),
         borders="“Borders” counts only the band that moving borders sweep over."
         if has_band
         else "",
-        view=make_view("images", "Images", comparison.images, comparison.reference),
+        curves=comparison.curves,
+        view=make_view("images", comparison.shown, comparison.images, comparison.reference),
     )
     with output_file(path, overwrite=overwrite) as temporary:
         temporary.write_text(page, encoding="utf-8")
@@ -130,7 +143,12 @@ def short_names(paths: Sequence[Path]) -> list[str]:
     return [f"{index} {path}" for index, path in enumerate(paths, start=1)]
 
 
-def _check_size(image: Tensor, path: Path, reference: Tensor, reference_path: Path) -> None:
+def check_size(image: Tensor, path: Path, reference: Tensor, reference_path: Path) -> None:
+    """Refuse an image of another size than its reference; with both files.
+
+    Raises:
+        FrameError: if they differ.
+    """
     if image.shape != reference.shape:
         (h, w), (rh, rw) = image.shape[-2:], reference.shape[-2:]
         raise FrameError(

@@ -13,9 +13,9 @@ from torch import Tensor
 from torchblur.errors import FrameError
 from torchblur.filters import BlurFilter
 from torchblur.frame import Frame
-from torchblur.metrics import border_band, evaluate, prepare_flip_ldr, temporal_error
-from torchblur.metrics.pooling import weighted_median
+from torchblur.metrics import border_band, evaluate, prepare_flip_ldr
 from torchblur.presets import create_filter
+from tuning.sequence_scores import FrameByFrame
 
 __all__ = ["BASELINES", "Scores", "SequenceJudge", "asked_name", "judge", "mean_scores"]
 
@@ -85,7 +85,7 @@ class SequenceJudge:
 
     def __init__(self, blur: BlurFilter) -> None:
         self._blur = blur
-        self._before: tuple[dict[str, Tensor], Tensor] | None = None
+        self._frames: dict[str, FrameByFrame] = {}
 
     @torch.no_grad()
     def judge(
@@ -112,18 +112,10 @@ class SequenceJudge:
         prepared = prepare_flip_ldr(reference)
         scores = {}
         for name, image in images.items():
-            found = evaluate(image, reference, masks=band, prepared=prepared)
-            found["flip_median"] = weighted_median(prepared.error(image))
-            found["temporal"] = self._change(name, image, reference)
-            scores[name] = {key: float(found[key]) for key in _OF_SEQUENCES}
-        self._before = (images, reference)
+            frames = self._frames.setdefault(name, FrameByFrame())
+            found = frames.figures(image, reference, masks=band, prepared=prepared)
+            scores[name] = {key: found[key] for key in _OF_SEQUENCES}
         return scores
-
-    def _change(self, name: str, image: Tensor, reference: Tensor) -> Tensor:
-        if self._before is None or self._before[1].shape != reference.shape:
-            return torch.tensor(math.nan)
-        images, truth = self._before
-        return temporal_error(image, images[name], reference, truth).mean()
 
 
 def asked_name(blur: BlurFilter) -> str:

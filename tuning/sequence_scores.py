@@ -8,12 +8,19 @@ from collections.abc import Mapping, Sequence
 import torch
 from torch import Tensor
 
-from torchblur.metrics import evaluate, prepare_flip_ldr, temporal_errors
+from torchblur.metrics import FlipReference, evaluate, prepare_flip_ldr, temporal_error
 from torchblur.metrics.pooling import weighted_median
 from tuning.cases import SequenceCase
 from tuning.result import CaseScore, FrameScore
 
-__all__ = ["finite_or_none", "mean_of_frames", "noisy_frames", "score_frames", "sequence_figures"]
+__all__ = [
+    "FrameByFrame",
+    "finite_or_none",
+    "mean_of_frames",
+    "noisy_frames",
+    "score_frames",
+    "sequence_figures",
+]
 
 
 def score_frames(case: SequenceCase, variant: str, images: Sequence[Tensor]) -> CaseScore:
@@ -41,36 +48,73 @@ def score_frames(case: SequenceCase, variant: str, images: Sequence[Tensor]) -> 
     )
 
 
-@torch.no_grad()
+class FrameByFrame:
+    """Figures of one sequence, a frame at a time; it keeps the frame before and no more."""
+
+    def __init__(self) -> None:
+        self._before: tuple[Tensor, Tensor] | None = None
+
+    @torch.no_grad()
+    def figures(
+        self,
+        image: Tensor,
+        reference: Tensor,
+        *,
+        masks: Mapping[str, Tensor] | None = None,
+        prepared: FlipReference | None = None,
+        begins_shot: bool = False,
+    ) -> dict[str, float]:
+        """Return the figures of the next frame.
+
+        Args:
+            image: Scene-linear radiance, (1, 3, H, W).
+            reference: The same of the reference.
+            masks: As in `evaluate`.
+            prepared: The reference prepared for FLIP, if there are several images.
+            begins_shot: Whether its change from the frame before is no error. One of another size
+                begins a shot too.
+
+        Returns:
+            What `evaluate` returns; "flip_median", the weighted median of the FLIP map; and
+            "temporal", the mean error of the change from the frame before in display values, NaN
+            at the first frame of a shot.
+        """
+        prepared = prepare_flip_ldr(reference) if prepared is None else prepared
+        found = evaluate(image, reference, masks=masks, prepared=prepared)
+        figures = {name: float(value) for name, value in found.items()}
+        figures["flip_median"] = float(weighted_median(prepared.error(image)))
+        figures["temporal"] = math.nan
+        if self._before is not None and not begins_shot:
+            previous, truth = self._before
+            if truth.shape == reference.shape:
+                change = temporal_error(image, previous, reference, truth)
+                figures["temporal"] = float(change.mean())
+        self._before = (image, reference)
+        return figures
+
+
 def sequence_figures(
     images: Sequence[Tensor],
     references: Sequence[Tensor],
     *,
-    bands: Sequence[Tensor] | None = None,
+    bands: Sequence[Tensor],
     cuts: Sequence[int] = (),
 ) -> list[dict[str, float | None]]:
-    """Return the figures of each frame.
+    """Return the figures of each frame; None where there is no finite one.
 
     Args:
         images: Scene-linear radiance, (1, 3, H, W) each.
         references: The same of the references.
         bands: Band at moving borders of each frame, bool, (1, 1, H, W).
         cuts: Positions of frames that begin a new shot.
-
-    Returns:
-        For each frame what `evaluate` returns; "flip_median", the weighted median of its FLIP map;
-        and "temporal", the mean error of the change from the frame before in display values. None
-        where there is no finite figure.
     """
-    changes = temporal_errors(images, references, cuts=cuts)[:, 0]
-    figures = []
+    frames = FrameByFrame()
+    found = []
     for index, (image, reference) in enumerate(zip(images, references, strict=True)):
-        prepared = prepare_flip_ldr(reference)
-        masks = {} if bands is None else {"band": bands[index]}
-        found = evaluate(image, reference, masks=masks, prepared=prepared)
-        found |= {"flip_median": weighted_median(prepared.error(image)), "temporal": changes[index]}
-        figures.append({name: finite_or_none(float(value)) for name, value in found.items()})
-    return figures
+        masks = {"band": bands[index]}
+        figures = frames.figures(image, reference, masks=masks, begins_shot=index in cuts)
+        found.append({name: finite_or_none(value) for name, value in figures.items()})
+    return found
 
 
 def mean_of_frames(figures: Sequence[Mapping[str, float | None]]) -> dict[str, float | None]:
