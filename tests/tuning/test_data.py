@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 import torch
+import trimesh
 from planted import planted_case, tiny_frame
 
 import tuning.data
@@ -67,6 +68,26 @@ class TestScenes:
         with pytest.raises(AssertionError, match="rendered again"):
             load_cases(spec_of(tmp_path, train=[item | {"shutter": 1.0}]))
         write_scene(tmp_path, "a.yaml", speed=2.0)
+        with pytest.raises(AssertionError, match="rendered again"):
+            load_cases(spec_of(tmp_path, train=[item]))
+
+    def test_a_changed_mesh_is_rendered_again(self, tmp_path, own_cache, monkeypatch):
+        """The file of a mesh counts by what it holds, not by its name."""
+        (tmp_path / "shapes").mkdir()
+        mesh = tmp_path / "shapes" / "ball.ply"
+        trimesh.creation.icosphere(subdivisions=1).export(mesh)
+        (tmp_path / "a.yaml").write_text(
+            "camera: {position: [0, 0, 5]}\nbodies: [{kind: mesh, path: shapes/ball.ply}]\n"
+        )
+        item = {"kind": "scene", "path": "a.yaml", "size": "24x16", "spp": 4, "color_spp": 2}
+        load_cases(spec_of(tmp_path, train=[item]))
+
+        def fail(*args, **kwargs):
+            raise AssertionError("rendered again")
+
+        monkeypatch.setattr(tuning.data, "render_reference", fail)
+        load_cases(spec_of(tmp_path, train=[item]))
+        trimesh.creation.icosphere(subdivisions=2).export(mesh)
         with pytest.raises(AssertionError, match="rendered again"):
             load_cases(spec_of(tmp_path, train=[item]))
 
