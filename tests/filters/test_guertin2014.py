@@ -12,6 +12,7 @@ class TestGuertin2014(FilterContract):
     function = staticmethod(guertin2014)
     plain = {"noise": "none"}
     acts_with = {
+        "background_depth": {"background": "revealed"},
         "soft_depth_extent": {"depth_compare": "absolute"},
         "early_out": {"tile_size": 2},
         "tau": {"tile_size": 8},

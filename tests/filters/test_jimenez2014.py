@@ -13,6 +13,7 @@ class TestJimenez2014(FilterContract):
     # "strict" because the ports' rule breaks ties by the order of the taps, that is by the sign.
     plain = {"noise": "none", "mirror_filter": "strict"}
     acts_with = {
+        "background_depth": {"background": "revealed"},
         "early_out": {"tile_size": 2},
         "tile_jitter": {"tile_size": 8},
         "neighbor_culling": {"tile_size": 8},

@@ -6,4 +6,4 @@ class TestMcGuire2012(FilterContract):
     filter_class = McGuire2012Blur
     function = staticmethod(mcguire2012)
     plain = {"noise": "none"}
-    acts_with = {"early_out": {"tile_size": 2}}
+    acts_with = {"early_out": {"tile_size": 2}, "background_depth": {"background": "revealed"}}

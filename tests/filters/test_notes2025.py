@@ -17,6 +17,7 @@ class TestNotes2025(FilterContract):
     function = staticmethod(notes2025)
     plain = {"noise": "none", "mirror_filter": "strict"}
     acts_with = {
+        "background_depth": {"background": "revealed"},
         "tile_jitter": {"tile_size": 8},
         "early_out": {"tile_size": 2},
         "relative_depth_range": {"depth_compare": "relative"},

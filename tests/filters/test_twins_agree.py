@@ -107,7 +107,9 @@ def both(name, frame, params):
     if name == "sousa2013":
         streams = [noise_plane(kind, frame.color, i, seed)[0, 0].numpy() for i in range(4)]
         planes = {"tap_noise": 2 * np.stack(streams) - 1}
-    return blur.layers(frame), TWINS[name](*arrays, **planes, **blur.config.model_dump())
+    # The revealed background is ours; the twins know what is published.
+    settings = blur.config.model_dump(exclude={"background", "background_depth"})
+    return blur.layers(frame), TWINS[name](*arrays, **planes, **settings)
 
 
 @pytest.mark.parametrize(

@@ -19,6 +19,7 @@ from torchblur.filters.reconstruction import (
     spread_of,
     texture_of,
 )
+from torchblur.filters.revealed import RevealedBackgroundConfig, revealed_inputs
 from torchblur.frame import Frame, Shutter
 from torchblur.ops.color import luma
 from torchblur.ops.gather import Engine, Inputs, Lookup, gather, pixel_grid
@@ -35,7 +36,7 @@ _GOLDEN = 0.6180339887498949  # spreads the taps of one direction evenly over th
 
 
 # fmt: off
-class Guertin2014Config(ReconstructionConfig):
+class Guertin2014Config(RevealedBackgroundConfig, ReconstructionConfig):
     """Parameters of Guertin 2014; the defaults are the paper's."""
 
     num_samples: Annotated[
@@ -236,6 +237,7 @@ def _layers(frame: Frame, values: Values, engine: Engine) -> dict[str, Tensor]:
         inputs["variance"] = tile_lookup(
             layers["tile_variance"], frame.color, values.tile_size, bilinear=True
         )
+    inputs |= revealed_inputs(frame, values, lambda f, v: _layers(f, v, engine)["color"])
     sums = gather(_tap, _options(values), values.num_samples, inputs, engine)
     center_weight = values.num_samples / (values.kappa * inputs["length_p"])
     if not values.center_weight:

@@ -7,8 +7,9 @@ from typing import Annotated, Any, Literal, NamedTuple
 import torch
 from torch import Tensor
 
-from torchblur.filters.base import BlurFilter, FilterConfig, Values
+from torchblur.filters.base import BlurFilter, Values
 from torchblur.filters.reconstruction import Spread, Tap, Tiles, sample, spread_of, texture_of
+from torchblur.filters.revealed import RevealedBackgroundConfig, revealed_inputs
 from torchblur.frame import Frame, Shutter
 from torchblur.ops.gather import Engine, Inputs, Lookup, gather, pixel_grid
 from torchblur.ops.noise import NoiseKind, dither_2x2, noise_plane
@@ -24,7 +25,7 @@ _SHORTEST_REACH = 1e-3  # px; what is shorter has no direction either
 
 
 # fmt: off
-class Jimenez2014Config(FilterConfig):
+class Jimenez2014Config(RevealedBackgroundConfig):
     """Parameters of Jimenez 2014; the defaults are those of the ports that agree."""
 
     num_samples: Annotated[
@@ -207,6 +208,7 @@ def _layers(frame: Frame, values: Values, engine: Engine) -> dict[str, Tensor]:
     least = tile_lookup(shortest, frame.color, values.tile_size, offset)
     tile_class = _tile_class(length(dominant), least, values)
     inputs = _tap_inputs(frame, spread, dominant, tile_class == 1, values)
+    inputs |= revealed_inputs(frame, values, lambda f, v: _layers(f, v, engine)["color"])
     options = _Options(
         Shutter(1, values.shutter_position).center,
         values.depth_compare == "relative",

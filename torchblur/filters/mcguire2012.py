@@ -17,6 +17,7 @@ from torchblur.filters.reconstruction import (
     spread_of,
     texture_of,
 )
+from torchblur.filters.revealed import RevealedBackgroundConfig, revealed_inputs
 from torchblur.frame import Frame, Shutter
 from torchblur.ops.gather import Engine, Inputs, Lookup, gather, pixel_grid
 from torchblur.ops.noise import noise_plane
@@ -29,7 +30,7 @@ __all__ = ["McGuire2012Blur", "McGuire2012Config", "mcguire2012"]
 
 
 # fmt: off
-class McGuire2012Config(ReconstructionConfig):
+class McGuire2012Config(RevealedBackgroundConfig, ReconstructionConfig):
     """Parameters of McGuire 2012."""
 
     soft_depth_extent: Annotated[
@@ -130,6 +131,7 @@ def _layers(frame: Frame, values: Values, engine: Engine) -> dict[str, Tensor]:
     }
     for key in WEIGHT_PARAMETERS:
         inputs[key] = getattr(values, key)
+    inputs |= revealed_inputs(frame, values, lambda f, v: _layers(f, v, engine)["color"])
     options = _Options(
         Shutter(1, values.shutter_position).center,
         values.skip_middle_tap and values.shutter_position == "centered",

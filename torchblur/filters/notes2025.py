@@ -13,6 +13,7 @@ from torchblur.filters.notes2025_config import Notes2025Config
 from torchblur.filters.notes2025_gather import Blurred, Line, compose, gather_line, shared_inputs
 from torchblur.filters.notes2025_postfilter import post_filter
 from torchblur.filters.reconstruction import Spread
+from torchblur.filters.revealed import layer_behind, revealed_inputs
 from torchblur.frame import Frame, Shutter
 from torchblur.ops.directions import TileDirections, tile_directions
 from torchblur.ops.gather import Engine
@@ -88,6 +89,7 @@ def _layers(frame: Frame, values: Values, engine: Engine) -> dict[str, Tensor]:
     linear = tile_lookup(least, frame.color, values.tile_size, offset) >= values.bilinear_min
     lines = _lines(first, second, linear, values)
     shared = shared_inputs(frame, spread, linear, values)
+    shared |= revealed_inputs(frame, values, lambda f, v: _whole(f, v, engine))
     sums = [gather_line(shared, line, values, engine) for line in lines]
     image = compose(frame, sums, lines[0].used, values)
     if values.resolution == "half" and values.alpha_fade:
@@ -95,6 +97,15 @@ def _layers(frame: Frame, values: Values, engine: Engine) -> dict[str, Tensor]:
     if values.post_filter:
         image = post_filter(frame, image, lines, values, engine)
     return image._asdict() | tiles._asdict()
+
+
+def _with(values: Values, **changed: object) -> Values:
+    return Values(**(vars(values) | changed))
+
+
+def _whole(frame: Frame, values: Values, engine: Engine) -> Tensor:
+    """Return the blurred color alone, over the sharp one also where that is left for later."""
+    return _layers(frame, _with(values, resolution="full", post_filter=False), engine)["color"]
 
 
 def _motion(frame: Frame, values: Values) -> tuple[Spread, TileDirections, Tensor]:
@@ -204,7 +215,12 @@ def _half_frame(frame: Frame, values: Values) -> Frame:
         color = box_halve(frame.color * frame.valid.to(frame.dtype))
         color = color / torch.where(share > 0, share, 1.0)
         valid = share > 0
-    return Frame(color=color, velocity=planes[:, :2], depth=planes[:, 2:], valid=valid)
+    layer = None
+    if values.background == "revealed":
+        layer = _half_frame(layer_behind(frame)[0], _with(values, background="guessed"))
+    return Frame(
+        color=color, velocity=planes[:, :2], depth=planes[:, 2:], valid=valid, revealed=layer
+    )
 
 
 def _faded(image: Blurred, values: Values) -> Blurred:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Annotated, Literal
 
-from torchblur.filters.base import FilterConfig
+from torchblur.filters.revealed import RevealedBackgroundConfig
 from torchblur.ops.directions import DirectionReduction
 from torchblur.ops.spread import Mirror, SpreadForm
 from torchblur.params import Param
@@ -23,7 +23,7 @@ _CORNERS = "rounds the corners of the clamped weights, so that gradients pass th
 
 
 # fmt: off
-class Notes2025Config(FilterConfig):
+class Notes2025Config(RevealedBackgroundConfig):
     """Parameters of the 2025 notes. The defaults are full resolution with all that it has.
 
     Where the text builds one direction it goes with ``depth_level=0.5`` and without direction

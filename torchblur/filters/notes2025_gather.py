@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from torchblur.filters.base import Values
-from torchblur.filters.reconstruction import Spread, Tap, sample, texture_of
+from torchblur.filters.reconstruction import ColorLookup, Spread, Tap, sample, texture_of
 from torchblur.frame import Frame, Shutter
-from torchblur.ops.gather import Engine, Inputs, gather, lookup, pixel_grid
+from torchblur.ops.gather import Engine, Inputs, gather, pixel_grid
 from torchblur.ops.noise import dither_2x2, noise_plane
 from torchblur.ops.spread import Mirror, SpreadForm, TapPair, depth_shares, mirror, spread_weight
 from torchblur.ops.velocity import direction, length
@@ -69,7 +69,7 @@ class _Options(NamedTuple):
     direction_weights: bool
     accurate_alpha: bool
     softness: float
-    color_lookup: Literal["nearest", "bilinear", "opportunistic"]
+    color_lookup: ColorLookup
 
 
 def shared_inputs(frame: Frame, spread: Spread, linear: Tensor, values: Values) -> Inputs:
@@ -173,7 +173,7 @@ def _tap(t: Tensor, inputs: Inputs, options: _Options) -> tuple[Tap, Tensor]:
     reach, unit = inputs["reach"], inputs["direction"]
     along = (t + options.center) * reach
     dx, dy = unit.split(1, 1)
-    tap = _look_up(inputs["x"] - along * dx, inputs["y"] - along * dy, inputs, options)
+    tap = sample(inputs, inputs["x"] - along * dx, inputs["y"] - along * dy, options.color_lookup)
     toward = tap.unit_x * dx + tap.unit_y * dy
     distance_s = distance_p = along.abs()
     if options.center:
@@ -197,18 +197,6 @@ def _tap(t: Tensor, inputs: Inputs, options: _Options) -> tuple[Tap, Tensor]:
     if options.accurate_alpha:
         alpha = saturate(foreground / (1 + inputs["area_slope"] * tap.length), options.softness)
     return tap, torch.cat((background, foreground, alpha), 1)
-
-
-def _look_up(x: Tensor, y: Tensor, inputs: Inputs, options: _Options) -> Tap:
-    if options.color_lookup != "opportunistic":
-        return sample(inputs, x, y, options.color_lookup)
-    tap = sample(inputs, x, y, "nearest")
-    texture, linear = inputs["texture"], inputs["linear"] > 0
-    color = torch.where(linear, lookup(texture[:, :3], x, y, "bilinear"), tap.color)
-    if tap.valid is None:
-        return tap._replace(color=color)
-    valid = torch.where(linear, lookup(texture[:, 7:], x, y, "bilinear"), tap.valid)
-    return tap._replace(color=color, valid=valid)
 
 
 def _spread(distance: Tensor, size: Tensor, inputs: Inputs, options: _Options) -> Tensor:

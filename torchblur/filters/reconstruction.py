@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Annotated, NamedTuple
+from typing import Annotated, Literal, NamedTuple
 
 import torch
 from torch import Tensor
 
 from torchblur.filters.base import FilterConfig, Values
+from torchblur.filters.revealed import background_share
 from torchblur.frame import Frame, Shutter
 from torchblur.ops.gather import Inputs, Lookup, lookup
 from torchblur.ops.noise import NoiseKind
@@ -17,6 +18,7 @@ from torchblur.params import Param
 
 __all__ = [
     "WEIGHT_PARAMETERS",
+    "ColorLookup",
     "ReconstructionConfig",
     "Spread",
     "Tap",
@@ -27,6 +29,8 @@ __all__ = [
     "spread_of",
     "texture_of",
 ]
+
+ColorLookup = Literal["nearest", "bilinear", "opportunistic"]
 
 _WEIGHTS = "McGuire 2012, section 3.3 (restated by Tan 2022, appendix, eq. 5-10)"
 
@@ -291,15 +295,39 @@ class Tap(NamedTuple):
     valid: Tensor | None
 
 
-def sample(inputs: Inputs, x: Tensor, y: Tensor, color_lookup: Lookup) -> Tap:
-    """Look up a tap at positions in px; the color bilinearly if asked for."""
+def sample(inputs: Inputs, x: Tensor, y: Tensor, color_lookup: ColorLookup) -> Tap:
+    """Look up a tap.
+
+    Args:
+        inputs: "texture" from `texture_of`; "linear" (0 or 1, (B, 1, H, W)) for an opportunistic
+            lookup; the planes of `revealed_inputs`, if any, and "depth".
+        x: Column, px.
+        y: Row, px.
+        color_lookup: Lookup of the color (and of its validity): nearest, bilinear, or bilinear
+            where "linear" is 1. All else is nearest.
+
+    Returns:
+        The tap; what shows the revealed layer has its color.
+    """
     texture = inputs["texture"]
     planes = lookup(texture, x, y)
     color, ux, uy, size, depth, *valid = planes.split((3, *[1] * (planes.shape[1] - 3)), 1)
-    if color_lookup == "bilinear":
-        color = lookup(texture[:, :3], x, y, "bilinear")
-        valid = [lookup(v, x, y, "bilinear") for v in texture[:, 7:].split(1, 1) if valid]
-    return Tap(color, ux, uy, size, depth, valid[0] if valid else None)
+    if color_lookup != "nearest":
+        near = [color, *valid]
+        fine = [lookup(texture[:, :3], x, y, "bilinear")]
+        fine += [lookup(texture[:, 7:], x, y, "bilinear") for _ in valid]
+        if color_lookup == "opportunistic":
+            linear = inputs["linear"] > 0
+            fine = [torch.where(linear, f, n) for f, n in zip(fine, near, strict=True)]
+        color, *valid = fine
+    tap = Tap(color, ux, uy, size, depth, valid[0] if valid else None)
+    if "revealed" not in inputs:
+        return tap
+    share = background_share(inputs, x, y, depth)
+    color = color + share * (inputs["revealed"] - color)
+    return tap._replace(
+        color=color, valid=None if tap.valid is None else tap.valid + share * (1 - tap.valid)
+    )
 
 
 def resolve(

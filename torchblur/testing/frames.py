@@ -66,7 +66,8 @@ def moving_square(
 
     Depths lie close together and the directions differ, so that depth, direction, cone and
     cylinder weights are all partly open; the left quarter of the background is slow. Each
-    parameter of a filter has something to act on.
+    parameter of a filter has something to act on: there are object numbers (1 is the square),
+    normals, and the background behind the square as revealed layer.
 
     Args:
         height: H in px.
@@ -90,7 +91,22 @@ def moving_square(
     motion[..., : width // 4] *= 0.4
     wobble = torch.randn(motion.shape, generator=generator, dtype=dtype)
     grain = torch.rand(1, 1, height, width, generator=generator, dtype=dtype)
-    return Frame(color=color, velocity=motion + 0.7 * wobble, depth=plane(*depths) + 0.3 * grain)
+    square = Frame(color=color, velocity=motion + 0.7 * wobble, depth=plane(*depths) + 0.3 * grain)
+    normal = torch.cat([plane(0.6, 0.0), plane(0.0, 0.0), plane(-0.8, -1.0)], 1)
+    normal = normal + 0.2 * torch.randn(normal.shape, generator=generator, dtype=dtype)
+    back = torch.rand(color.shape, generator=generator, dtype=dtype)
+    flow = torch.tensor(background, dtype=dtype).view(1, 2, 1, 1)
+    behind = Frame(
+        color=torch.where(inside, back, color),
+        velocity=torch.where(inside, flow + 0.7 * wobble, square.velocity),
+        depth=torch.where(inside, depths[1] + 0.3 * grain, square.require("depth")),
+    )
+    return dataclasses.replace(
+        square,
+        normal=torch.nn.functional.normalize(normal, dim=1),
+        object_id=inside.to(torch.int32),
+        revealed=behind,
+    )
 
 
 def as_stream(frame: Frame, seed: int = 0) -> Frame:
