@@ -1,7 +1,7 @@
 import pytest
 import torch
 
-from torchblur.ops.weights import cone, cylinder, depth_weights, power, saturate
+from torchblur.ops.weights import cone, cylinder, depth_weights, power, saturate, threshold
 
 
 def t(*values):
@@ -66,3 +66,10 @@ def test_power_has_finite_gradients_at_zero():
     assert bool(torch.isfinite(base.grad).all())
     assert bool(torch.isfinite(exponent.grad))
     assert power(t(0.0, 0.25), 0.5).tolist() == [0.0, 0.5]
+
+
+def test_threshold_hard_and_soft():
+    values = t(-1.0, 0.0, 1e-6, 2.0)
+    assert threshold(values).tolist() == [0, 0, 1, 1]
+    soft = threshold(t(-1.0, -0.1, 0.0, 0.1, 1.0), softness=0.2)
+    assert soft.tolist() == pytest.approx([0, 0.1192, 0.5, 0.8808, 1], abs=1e-4)

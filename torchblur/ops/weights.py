@@ -8,7 +8,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-__all__ = ["DepthWeights", "cone", "cylinder", "depth_weights", "power", "saturate"]
+__all__ = ["DepthWeights", "cone", "cylinder", "depth_weights", "power", "saturate", "threshold"]
 
 _TINY = 1e-9
 
@@ -123,3 +123,20 @@ def power(base: Tensor, exponent: float | Tensor) -> Tensor:
     """
     positive = base > _TINY
     return torch.where(positive, torch.where(positive, base, 1.0) ** exponent, 0.0)
+
+
+def threshold(value: Tensor, softness: float = 0.0) -> Tensor:
+    """Return 1 where a value is above 0, else 0.
+
+    Args:
+        value: Any shape.
+        softness: Above 0 a logistic step of about this width takes its place.
+
+    Returns:
+        Values in [0, 1], same shape.
+
+    Differentiable: with a softness; a hard step has no gradient.
+    """
+    if softness == 0:
+        return (value > 0).to(value.dtype)
+    return torch.sigmoid(value * (4 / softness))
