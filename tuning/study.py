@@ -14,10 +14,9 @@ import json
 import re
 import statistics
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -33,8 +32,12 @@ from tuning.progress import Progress, Stage
 from tuning.study_config import StudyConfig, StudyExr, StudyScene, StudyVariant, make_filter
 from tuning.study_data import Moment, identity_of, moments
 from tuning.study_figures import figures_of, hidden_mask, moving_mask, steadiness_of
+from tuning.study_rays import ray_facts, ray_mask_of, shutter_values, with_revealed
 
-__all__ = ["Row", "mean_of", "part_file", "picture_file", "run_study", "slug"]
+FACTS = "ray mask"
+"""Name of the variant that stands for figures of the data themselves."""
+
+__all__ = ["FACTS", "Row", "mean_of", "part_file", "picture_file", "run_study", "slug"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -76,6 +79,10 @@ def run_study(config: StudyConfig, folder: Path, progress: Progress | None = Non
         folder: Gets `parts/` with one file per data and variant, and `pictures/`.
         progress: Told after each frame.
 
+    Returns:
+        A row for each data, variant and reference, and if there is a ray mask one for each data
+        with a revealed layer: variant `FACTS`, without reference, with what `ray_facts` returns.
+
     Raises:
         TorchblurError: files that cannot be read, data without what a filter needs.
     """
@@ -83,6 +90,8 @@ def run_study(config: StudyConfig, folder: Path, progress: Progress | None = Non
     rows: list[Row] = []
     for item in config.data:
         wanted = config.variants_of(item)
+        if item.revealed and "ray_mask" in config.masks:
+            wanted = [*wanted, StudyVariant(name=FACTS)]
         missing = [v for v in wanted if not part_file(folder, config, item, v).is_file()]
         if missing:
             _measure(config, item, missing, folder, progress)
@@ -132,7 +141,9 @@ class _Runner:
     estimated: bool = False
 
     @torch.no_grad()
-    def image(self, moment: Moment) -> tuple[Tensor, dict[str, float | None]]:
+    def image(
+        self, moment: Moment, ray_mask: Tensor | None = None
+    ) -> tuple[Tensor, dict[str, float | None]]:
         """Return the image of a frame, and figures that the filter tells of itself."""
         variant = self.variant
         if self.blur is None:
@@ -140,7 +151,7 @@ class _Runner:
                 return moment.sharp.color, {}
             self.estimated |= variant.samples in moment.estimated
             return moment.raw[variant.samples], {}
-        frames = _frames(variant, moment)
+        frames = _frames(variant, moment, ray_mask)
         began = time.process_time()
         layers = self._layers(frames, moment)
         self.seconds.append(time.process_time() - began)
@@ -152,7 +163,7 @@ class _Runner:
         return layers[variant.layer], _told(layers)
 
     def _layers(self, frames: tuple[Frame, ...], moment: Moment) -> dict[str, Tensor]:
-        shutter: Any = {"shutter": moment.shutter.open, "shutter_position": moment.shutter.position}
+        shutter = shutter_values(moment.shutter)
         if not isinstance(self.blur, TemporalBlur):
             assert self.blur is not None
             return self.blur.layers(frames[0], **shutter)
@@ -175,10 +186,13 @@ class _Runner:
             figures["temporal"] = steadiness_of(
                 image, reference, before and (before[0], before[1][name])
             )
-            lists = self.figures.setdefault(name, {})
-            for key, value in {**figures, **told}.items():
-                lists.setdefault(key, []).append(value)
+            self.keep(name, {**figures, **told})
         self.before = (image, moment.references)
+
+    def keep(self, reference: str, figures: Mapping[str, float | None]) -> None:
+        lists = self.figures.setdefault(reference, {})
+        for key, value in figures.items():
+            lists.setdefault(key, []).append(value)
 
     def rows(self, item: StudyScene | StudyExr) -> list[Row]:
         return [
@@ -201,45 +215,52 @@ def _measure(
     folder: Path,
     progress: Progress | None,
 ) -> None:
-    runners = [_Runner(variant, make_filter(variant)) for variant in variants]
+    runners = [_Runner(v, make_filter(v)) for v in variants if v.name != FACTS]
+    facts = _Runner(StudyVariant(name=FACTS), None)
+    asked = len(runners) < len(variants)
     raw = tuple(v.samples for v in variants if v.filter is None and v.input == "stream")
     stage = Stage(item.name, item.count, progress)
     stage.step(0)
     for moment in moments(item, raw):
-        masks = _masks(config, moment)
+        masks = _masks(config, item, moment)
         judges = {name: prepare_flip_ldr(image) for name, image in moment.references.items()}
         shown = {f"reference {name}": image for name, image in moment.references.items()}
         for runner in runners:
-            image, told = runner.image(moment)
+            image, told = runner.image(moment, masks.get("ray_mask"))
             runner.compare(moment, image, told, judges, masks)
             shown[runner.variant.name] = image
+        if asked:
+            facts.keep("", ray_facts(item, moment, config.mask_params))
         if moment.index == item.shown:
+            shown |= {f"mask {name}": mask.float() for name, mask in masks.items()}
             for name, image in shown.items():
-                _show(picture_file(folder, item, name), image)
+                _show(picture_file(folder, item, name), image.expand(1, 3, -1, -1))
         stage.step(moment.index + 1)
-    for runner in runners:
+    for runner in [*runners, facts] if asked else runners:
         data = {"rows": [dataclasses.asdict(row) for row in runner.rows(item)]}
         path = part_file(folder, config, item, runner.variant)
         with output_file(path, overwrite=True) as temporary:
             temporary.write_text(json.dumps(data), encoding="utf-8")
 
 
-def _masks(config: StudyConfig, moment: Moment) -> dict[str, Tensor]:
-    makers = {
+def _masks(config: StudyConfig, item: StudyScene | StudyExr, moment: Moment) -> dict[str, Tensor]:
+    """Return the masks by name; those of rays only where there is something behind."""
+    makers: dict[str, Callable[[], Tensor]] = {
         "band": lambda: border_band(moment.sharp, moment.shutter),
         "moving": lambda: moving_mask(moment),
         "hidden": lambda: hidden_mask(moment),
+        "ray_mask": lambda: ray_mask_of(moment, config.mask_params),
     }
-    return {name: makers[name]() for name in config.masks}
+    return {name: makers[name]() for name in config.masks if name != "ray_mask" or item.revealed}
 
 
-def _frames(variant: StudyVariant, moment: Moment) -> tuple[Frame, ...]:
+def _frames(variant: StudyVariant, moment: Moment, ray_mask: Tensor | None) -> tuple[Frame, ...]:
     """Return what a filter is given."""
     if variant.input == "stream":
         return moment.samples[: variant.samples]
     if variant.revealed == "none":
         return (moment.sharp,)
-    return (dataclasses.replace(moment.sharp, revealed=moment.revealed),)
+    return (with_revealed(moment, ray_mask if variant.revealed == "mask" else None),)
 
 
 def _told(layers: Mapping[str, Tensor]) -> dict[str, float | None]:

@@ -270,6 +270,9 @@ def _check_known(names: Sequence[str], known: Sequence[str], where: str) -> None
 
 def _check_variant(config: StudyConfig, variant: StudyVariant, where: str) -> None:
     _check_known_data(config, variant, where)
+    for item in config.data:
+        if variant.revealed != "none" and (not variant.only or item.name in variant.only):
+            _check_revealed(config, item, where)
     if variant.filter is None:
         if variant.params or variant.revealed != "none" or variant.layer != "color":
             raise ConfigError(f"`params`, `revealed` and `layer` need a `filter` ({where})")
@@ -288,6 +291,16 @@ def _check_known_data(config: StudyConfig, variant: StudyVariant, where: str) ->
             raise ConfigError(
                 f"no data is called {name!r}{nearest_name(name, names)} ({where}.only)"
             )
+
+
+def _check_revealed(config: StudyConfig, item: StudyScene | StudyExr, where: str) -> None:
+    if not item.revealed or (isinstance(item, StudyExr) and item.revealed_color is None):
+        hint = "`revealed: true`" + (" and `revealed_color`" if isinstance(item, StudyExr) else "")
+        raise ConfigError(
+            f"{item.name!r} has no layer of what lies behind: it needs {hint} ({where}.revealed)"
+        )
+    if "ray_mask" not in config.masks:
+        raise ConfigError(f"`revealed` needs `ray_mask` among the masks ({where}.revealed)")
 
 
 def _check_filter(variant: StudyVariant, where: str) -> None:

@@ -15,16 +15,17 @@ from torchblur.errors import ConfigError
 from torchblur.frame import Frame, Shutter
 from torchblur.io import read_frame, read_image
 from torchblur.params import build
-from torchblur.render import Renderer, load_scene, render_revealed
+from torchblur.render import Renderer, Scene, load_scene, render_revealed
 from torchblur.render.camera import Camera
+from torchblur.render.compiling import Engine
 from tuning.frame_cache import cache_key, cached, frame_of, hash_scene, planes_of
 from tuning.numbering import numbered_file
 from tuning.study_config import KEPT_SAMPLES, StudyExr, StudyScene
 
-__all__ = ["Moment", "identity_of", "moments"]
+__all__ = ["Moment", "identity_of", "moments", "scene_of"]
 
 _WORTH_COMPILING = 8  # frames
-_HIDDEN_SPP = 64  # times at which the true set of revealed pixels is sampled
+_HIDDEN_SPP = 32  # times at which the true set of revealed pixels is sampled
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -120,17 +121,20 @@ def _hash_scene(path: str, _: int) -> str:
     return hash_scene(Path(path))
 
 
-def _renderer(item: StudyScene) -> Renderer:
+def scene_of(item: StudyScene) -> Scene:
+    """Return an item's scene, with its own camera."""
     scene = load_scene(item.path)
-    if item.camera:
-        values = scene.camera.model_dump(exclude_unset=True) | item.camera
-        camera = build(Camera, values, f"data {item.name!r}: camera")
-        scene = scene.model_copy(update={"camera": camera})
-    return Renderer(scene, engine="compiled" if item.count >= _WORTH_COMPILING else "auto")
+    if not item.camera:
+        return scene
+    values = scene.camera.model_dump(exclude_unset=True) | item.camera
+    camera = build(Camera, values, f"data {item.name!r}: camera")
+    return scene.model_copy(update={"camera": camera})
 
 
 def _render(item: StudyScene, time: float) -> dict[str, Tensor]:
-    renderer, size, shutter = _renderer(item), item.height_width, item.exposure
+    engine: Engine = "compiled" if item.count >= _WORTH_COMPILING else "auto"
+    renderer = Renderer(scene_of(item), engine=engine)
+    size, shutter = item.height_width, item.exposure
     # Sharp color, stream and references must not share their noise.
     sharp = renderer.frame(size, frame=time, color_spp=item.color_spp, seed=item.seed)
     tensors = planes_of(sharp, "sharp")

@@ -79,7 +79,7 @@ def hidden_mask(moment: Moment) -> Tensor:
     A pixel counts if what its center sees at the middle of the shutter moves, and if for more
     than 5 % of the shutter's time something of another id lies there, farther away.
 
-    For scenes that is counted over 64 rays, each at its own time. For files it is estimated from
+    For scenes that is counted over 32 rays, each at its own time. For files it is estimated from
     the sharp frame: the object is carried along its own velocity in a straight line, so at time s
     the pixel has what lies at ``p - v s`` in the sharp frame; if that has another id and lies
     deeper, the object has moved away. What comes in from outside the image is not known and does

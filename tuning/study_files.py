@@ -14,7 +14,7 @@ from PIL import Image, ImageDraw, ImageFont
 
 from torchblur.errors import OutputError
 from torchblur.io.paths import output_file
-from tuning.study import Row, picture_file, slug
+from tuning.study import FACTS, Row, picture_file, slug
 from tuning.study_config import StudyConfig, StudyExr, StudyScene
 from tuning.study_figures import worth_of
 from tuning.study_plots import plot_samples, plot_time
@@ -55,12 +55,7 @@ def check_study_outputs(folder: Path, *, overwrite: bool = False) -> None:
 
 
 def write_study(
-    folder: Path,
-    config: StudyConfig,
-    rows: Sequence[Row],
-    facts: Mapping[str, Mapping[str, float | None]] | None = None,
-    *,
-    overwrite: bool = False,
+    folder: Path, config: StudyConfig, rows: Sequence[Row], *, overwrite: bool = False
 ) -> list[Path]:
     """Write `study.json`, `tables.md`, `tables.csv`, plots, and a sheet of pictures per data.
 
@@ -68,17 +63,22 @@ def write_study(
         folder: Where to.
         config: The configuration.
         rows: What `run_study` returned.
-        facts: Figures of the data themselves, by name of the data.
         overwrite: Replace files that are there.
 
     Raises:
         OutputError: a file exists, or cannot be written.
     """
     check_study_outputs(folder, overwrite=overwrite)
+    facts = {
+        row.data: {name: row.mean(name) for name in row.figures}
+        for row in rows
+        if row.variant == FACTS
+    }
+    rows = [row for row in rows if row.variant != FACTS]
     files = [*_plots(folder, config, rows), *_sheets(folder, config, rows)]
     texts = {
-        "study.json": _json(config, rows, facts or {}),
-        "tables.md": _markdown(config, rows, facts or {}),
+        "study.json": _json(config, rows, facts),
+        "tables.md": _markdown(config, rows, facts),
         "tables.csv": _csv(rows),
     }
     for name, text in texts.items():
@@ -203,7 +203,8 @@ def _heading(name: str) -> str:
 
 
 def _facts_line(facts: Mapping[str, float | None]) -> str:
-    return "; ".join(f"{name} {_text(value, 4)}" for name, value in facts.items())
+    parts = [f"{name} {'–' if value is None else f'{value:.4g}'}" for name, value in facts.items()]
+    return f"Ray mask: {'; '.join(parts)}"
 
 
 def _text(value: float | None, digits: int) -> str:

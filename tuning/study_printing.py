@@ -5,13 +5,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from tuning.console import metrics_table, results
-from tuning.study import Row
+from tuning.study import FACTS, Row
 
 __all__ = ["print_study"]
 
 
 def print_study(rows: Sequence[Row]) -> None:
     """Print FLIP, PSNR and SSIM of all variants, a table for each data and reference."""
+    rows = [row for row in rows if row.variant != FACTS]
     for data, reference in dict.fromkeys((row.data, row.reference) for row in rows):
         table = {
             row.variant: _row_means(row)
