@@ -15,7 +15,7 @@ from torchblur.errors import ConfigError, OutputError, nearest_name
 from torchblur.frame import LONGEST_SHUTTER, Shutter, ShutterPosition
 from torchblur.io import write_frame, write_image
 from torchblur.params import Config, build
-from torchblur.render import Renderer, Scene, load_scene, render_frame, render_reference
+from torchblur.render import Renderer, Scene, load_scene
 from tuning.outputs import made_by, make_folders, remove_leftovers, state_of
 from tuning.progress import Progress, Stage
 
@@ -130,8 +130,9 @@ def render_sequence(
     remove_leftovers([task.path for task in todo])
     stage = Stage("render", len(todo), progress)
     stage.step(0)
+    renderer = Renderer(scene, images=settings.frames)
     for done, task in enumerate(todo, start=1):
-        _render(task, scene, settings, made_by(task.recipe, path))
+        _render(task, renderer, settings, made_by(task.recipe, path))
         stage.step(done, message=task.path.name)
     return [task.path for task in tasks]
 
@@ -165,23 +166,22 @@ def _kinds(settings: RenderSettings) -> Iterator[tuple[str, int, str]]:
 
 
 def _render(
-    task: _Task, scene: Scene, settings: RenderSettings, metadata: Mapping[str, Any]
+    task: _Task, renderer: Renderer, settings: RenderSettings, metadata: Mapping[str, Any]
 ) -> None:
     size = (settings.height, settings.width)
     time, seed = settings.start + task.number, settings.seed + task.number
     shutter = Shutter(settings.shutter, settings.shutter_position)
     if task.kind == "frame":
-        frame = render_frame(scene, size, frame=time, color_spp=settings.color_spp, seed=seed)
+        frame = renderer.frame(size, frame=time, color_spp=settings.color_spp, seed=seed)
         write_frame(task.path, frame, metadata=metadata, overwrite=True)
         return
     if task.kind == "stream":
-        stream = Renderer(scene).stream_sample(
+        stream = renderer.stream_sample(
             size, task.sample, frame=time, shutter=shutter, seed=settings.seed
         )
         write_frame(task.path, stream, metadata=metadata, overwrite=True)
         return
-    result = render_reference(
-        scene,
+    result = renderer.reference(
         size,
         spp=settings.spp,
         shutter=shutter,

@@ -9,6 +9,7 @@ from scipy.stats import kstest, norm
 from torchblur.errors import ConfigError
 from torchblur.frame import Sequence, Shutter
 from torchblur.render import Renderer, load_scene, render_frame, render_reference, render_stream
+from torchblur.render.trace import Tracer
 
 PX = 4 / 32  # scene units per pixel at depth 4 and width 32
 SIZE = (8, 32)
@@ -254,6 +255,20 @@ def test_frames_make_a_sequence(crossing):
     sequence = Sequence(tuple(crossing.stream((6, 10), frame=f)[0] for f in range(3)))
     assert len(sequence) == 3
     assert set(sequence[2].layers()) == LAYERS
+
+
+def test_many_images_are_worth_compiling(crossing, monkeypatch):
+    asked = []
+
+    def tracer(*args, compiled=False, **others):
+        asked.append(compiled)
+        return Tracer(*args, **others)
+
+    monkeypatch.setattr("torchblur.render.renderer.Tracer", tracer)
+    crossing.stream((90, 160))
+    Renderer(crossing.scene, images=2000).stream((90, 160))
+    Renderer(crossing.scene, images=2000, engine="eager").stream((90, 160))
+    assert asked == [False, True, False]
 
 
 @pytest.mark.slow

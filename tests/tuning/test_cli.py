@@ -330,7 +330,7 @@ class TestRender:
             raise KeyboardInterrupt
 
         with monkeypatch.context() as patch:
-            patch.setattr(tuning.rendering, "render_reference", interrupted)
+            patch.setattr(tuning.rendering.Renderer, "reference", interrupted)
             result = run("render", scene, "-o", tmp_path, "--size", "64x48", code=130)
         assert "the same command goes on" in result.stderr
         assert [path.name for path in tmp_path.iterdir()] == [f"{scene.stem}.0000.exr"]

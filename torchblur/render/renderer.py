@@ -65,15 +65,22 @@ class Renderer:
             Without a compiler "compiled" is "eager" with one warning.
         device: Where to compute; results are there too. Random numbers come from the CPU, so
             that a seed means the same on all devices.
+        images: How many images of a kind will be asked for; with more, "auto" compiles sooner.
 
     Raises:
         ConfigError: if the engine has another name.
     """
 
     def __init__(
-        self, scene: Scene, *, engine: Engine = "auto", device: torch.device | str = "cpu"
+        self,
+        scene: Scene,
+        *,
+        engine: Engine = "auto",
+        device: torch.device | str = "cpu",
+        images: int = 1,
     ) -> None:
         check_engine(engine)
+        self._images = images
         self.scene = scene
         self.engine = engine
         self.device = torch.device(device)
@@ -164,7 +171,7 @@ class Renderer:
         return trace_stream(tracer, size, shutter or Shutter(1.0), planes[0], shift)
 
     def _compiles(self, size: tuple[int, int], spp: int) -> bool:
-        work = size[0] * size[1] * spp * self._num_bodies
+        work = size[0] * size[1] * spp * self._num_bodies * self._images
         return self.engine == "compiled" or (self.engine == "auto" and work > _WORTH_COMPILING)
 
     def _sampled(
