@@ -61,8 +61,8 @@ def test_the_second_pass_is_the_filter_on_the_result_of_the_first():
     assert torch.allclose(halves, expected, atol=1e-6)
 
 
-@pytest.mark.parametrize("name", sorted(registered_filters()))
-def test_every_filter_can_be_wrapped(name):
+@pytest.mark.parametrize("name", [n for n, f in registered_filters().items() if not f.needs])
+def test_every_filter_of_plain_frames_can_be_wrapped(name):
     frame = random_frame()
     still = frame.map(lambda t: torch.zeros_like(t) if t.shape[1] == 2 else t)
     blur = TwoPassBlur(get_filter(name)(), spread=0.2)
