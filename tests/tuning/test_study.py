@@ -1,5 +1,6 @@
 """Studies: figures against the library's own calls, memory, worth, files, resuming, refusals."""
 
+import dataclasses
 import json
 import math
 
@@ -15,13 +16,14 @@ from torchblur.io import write_frame, write_image
 from torchblur.metrics import flip_ldr, prepare_flip_ldr, psnr, ssim
 from torchblur.metrics.pooling import weighted_median
 from torchblur.metrics.temporal import temporal_error
-from torchblur.render import load_scene, render_reference, render_stream
+from torchblur.render import load_scene, render_reference, render_revealed, render_stream
 from tuning.commands import app
-from tuning.study import part_file, run_study
+from tuning.study import FACTS, part_file, run_study
 from tuning.study_config import load_study_config
 from tuning.study_data import Moment, moments
 from tuning.study_figures import agreement, figures_of, hidden_mask, worth_of
 from tuning.study_files import curve_of, worth_table, write_study
+from tuning.study_rays import ray_mask_of
 
 SCENE = """
 camera: {position: [0, 0, 5]}
@@ -275,6 +277,91 @@ class TestHidden:
         ids[:9, ..., 3], depths[:9, ..., 3] = 7, 3.0  # the wall does not move
         (line,) = hidden_mask(self.moment((ids, depths)))[0, 0].unique(dim=0)
         assert line.nonzero().flatten().tolist() == [9]
+
+
+class TestRays:
+    @pytest.fixture
+    def rays(self, study):
+        """The ball before the wall, with what it hides, through two filters."""
+        text = study.read_text()
+        text = text.replace("stream_spp: 4,", "revealed: true, revealed_spp: 2,")
+        text = text.replace("count: 3", "count: 2")
+        head, _, _ = text.partition("\nvariants:")
+        study.write_text(
+            head
+            + """
+variants:
+  - {name: plain, filter: tan2022}
+  - {name: all, filter: tan2022, revealed: all}
+  - {name: mask, filter: tan2022, revealed: mask}
+masks: [ray_mask, hidden]
+mask_params: {tile_size: 20}
+"""
+        )
+        return study
+
+    @pytest.mark.filterwarnings("ignore:tan2022. no layer `revealed`")
+    def test_layer_behind_is_given_as_asked(self, rays):
+        config = load_study_config(rays)
+        rows = run_study(config, rays.parent / "out")
+        (moment, _) = moments(config.data[0])
+        shutter = {"shutter": 1.0, "shutter_position": "centered"}
+        asked = get_filter("tan2022")(tile_size=20).layers(moment.sharp, **shutter)["ray_mask"] > 0
+        layer = moment.revealed
+        assert asked.any()
+        assert (layer.valid.bool() & ~asked).any()
+        masked = dataclasses.replace(layer, valid=layer.valid.bool() & asked)
+        for name, revealed in (("plain", None), ("all", layer), ("mask", masked)):
+            frame = dataclasses.replace(moment.sharp, revealed=revealed)
+            with torch.no_grad():
+                image = get_filter("tan2022")()(frame, **shutter)
+            want = psnr(image, moment.references["center"], mask=asked)
+            found = row_of(rows, name).figures["psnr_ray_mask"][0]
+            assert found == pytest.approx(float(want), rel=1e-5), name
+
+    @pytest.mark.filterwarnings("ignore:tan2022. no layer `revealed`")
+    def test_facts_of_the_mask(self, rays):
+        config = load_study_config(rays)
+        rows = run_study(config, rays.parent / "out")
+        (facts,) = (row for row in rows if row.variant == FACTS)
+        moment = next(iter(moments(config.data[0])))
+        mask, truth = ray_mask_of(moment, {"tile_size": 20}), hidden_mask(moment)
+        for name, value in agreement(mask, truth).items():
+            assert facts.figures[name][0] == value
+        assert facts.figures["recall_1px"][0] >= facts.figures["recall"][0] > 0
+        found = render_revealed(
+            load_scene(rays.parent / "ball.yaml"), (32, 48), frame=-1.0, mask=mask
+        )
+        assert facts.figures["rays"][0] == found.rays
+        assert facts.figures["rays_per_px"][0] == found.rays / (32 * 48)
+        for name in ("mask", "trace", "tiles"):
+            assert facts.mean(f"seconds_{name}") > 0
+        write_study(rays.parent / "out", config, rows)
+        assert "Ray mask: recall 0." in (rays.parent / "out" / "tables.md").read_text()
+        data = json.loads((rays.parent / "out" / "study.json").read_text())
+        assert data["facts"]["ball"]["rays"] == facts.mean("rays")
+        assert len(data["rows"]) == 3 * 2
+
+    def test_hidden_pixels_are_those_the_ball_leaves(self, rays):
+        """The ball moves by 1.2 diameters over 2: behind it the wall shows at its sides."""
+        moment = next(iter(moments(load_study_config(rays).data[0])))
+        truth, ball = hidden_mask(moment), moment.sharp.object_id == 2
+        assert (truth & ~ball).sum() == 0
+        share = moment.seen[0] != 2
+        left = share.float().mean(0, keepdim=True)[ball]
+        assert truth[ball].float().mean() > 0.3
+        assert left[truth[ball]].min() > 0.05
+
+    @pytest.mark.parametrize(
+        ("old", "new", "message"),
+        [
+            ("revealed: true,", "revealed: false,", r"'ball' has no layer.*`revealed: true`"),
+            ("masks: [ray_mask, ", "masks: [", r"needs `ray_mask`.*variants\.1\.revealed"),
+        ],
+    )
+    def test_what_is_missing_is_named(self, rays, old, new, message):
+        with pytest.raises(ConfigError, match=message):
+            load_study_config(edited(rays, old, new))
 
 
 class TestCommand:
