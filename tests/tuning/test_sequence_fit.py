@@ -141,15 +141,21 @@ class TestTruncation:
         assert self.gradient(9)[0] == pytest.approx(whole, rel=1e-9)
         assert abs(self.gradient(1)[0] - whole) > 0.05 * abs(whole)
 
+    @pytest.mark.parametrize("temporal", [0.0, 2.0])
     @pytest.mark.parametrize("unroll", [1, 2, 4])
-    def test_gradient_is_that_of_a_detached_history(self, unroll):
-        """By hand: the same sum with the filter's own truncation."""
+    def test_gradient_is_that_of_a_detached_history(self, unroll, temporal):
+        """By hand, with the filter's own truncation: what ended a part is a constant."""
         case = sequence_case(6)
         gain = torch.tensor(0.7, dtype=torch.float64, requires_grad=True)
         images = Recall().sequence(case.samples[0], detach_every=unroll, gain=gain)
-        loss = sum(((i - r) ** 2).mean() for i, r in zip(images, case.references, strict=True))
-        (want,) = torch.autograd.grad(loss / 6, gain)
-        assert self.gradient(unroll)[0] == pytest.approx(float(want), rel=1e-4)
+        truth = case.references
+        loss = sum(((i - r) ** 2).mean() for i, r in zip(images, truth, strict=True)) / 6
+        for k in range(1, 6):
+            before = images[k - 1].detach() if k % unroll == 0 else images[k - 1]
+            change = (images[k] - before) - (truth[k] - truth[k - 1])
+            loss = loss + temporal * change.abs().mean() / 5
+        (want,) = torch.autograd.grad(loss, gain)
+        assert self.gradient(unroll, temporal=temporal)[0] == pytest.approx(float(want), rel=1e-4)
 
     def test_whole_gradient_is_the_slope(self):
         case = sequence_case(6)
