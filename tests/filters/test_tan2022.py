@@ -100,6 +100,8 @@ def test_inner_blur_by_hand():
     bare = dataclasses.replace(frame, revealed=None)
     with pytest.warns(UserWarning, match="`revealed`"):
         assert color_at(bare, 49, **given) == shares(red, green, 0)
+    mask = Tan2022Blur(**QUIET).layers(frame)["ray_mask"][0, 0, 3] > 0
+    assert set(mask.nonzero().flatten().tolist()) in ({*range(40, 61)}, {*range(40, 62)})
     # trailing is the same at the leading edge
     assert color_at(frame, 60, **(given | {"shutter_position": "trailing"})) == shares(
         red / 3, 0, green * 3

@@ -99,6 +99,8 @@ def test_reach_by_hand():
         4,
         5,
     ]
+    # of two samples the second may lie outside, where nothing is found
+    assert reaches(edge, motion(-6.0), 2)[0, 0, 0].nonzero().flatten().tolist() == [0, 3]
     assert float(reaches(0.25 * mask, motion(-6.0), 6).max()) == 0.25
 
 
