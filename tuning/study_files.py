@@ -249,10 +249,11 @@ def _sheets(folder: Path, config: StudyConfig, rows: Sequence[Row]) -> list[Path
     """Lay the pictures of each data beside each other, with the FLIP of the frame shown."""
     files = []
     for item in config.data:
-        references = list(dict.fromkeys(row.reference for row in rows if row.data == item.name))
-        pictures = [
-            (f"reference {n}", picture_file(folder, item, f"reference {n}")) for n in references
-        ]
+        references = list(dict.fromkeys(r.reference for r in rows if r.data == item.name))
+        names = [f"reference {name}" for name in references]
+        names += [f"mask {name}" for name in config.masks]
+        pictures = [(name, picture_file(folder, item, name)) for name in names]
+        pictures = [(name, path) for name, path in pictures if path.is_file()]
         for row in rows:
             shown = not config.pictures or row.variant in config.pictures
             if row.data == item.name and row.reference == references[0] and shown:
