@@ -12,7 +12,7 @@ import tuning.study
 from torchblur.errors import ConfigError
 from torchblur.filters import get_filter
 from torchblur.frame import Frame, Shutter
-from torchblur.io import write_frame, write_image
+from torchblur.io import load_yaml, write_frame, write_image
 from torchblur.metrics import flip_ldr, prepare_flip_ldr, psnr, ssim
 from torchblur.metrics.pooling import weighted_median
 from torchblur.metrics.temporal import temporal_error
@@ -154,6 +154,9 @@ class TestRun:
         edited(study, "{num_samples: 15}", "{num_samples: 9}")
         assert row_of(run_study(load_study_config(study), folder), "line") != row_of(first, "line")
         assert len(calls) == 2
+        monkeypatch.setattr(tuning.study, "_source_hash", lambda: "another filter")
+        run_study(config, folder)
+        assert len(calls) == 3
 
 
 class TestFiles:
@@ -292,8 +295,8 @@ class TestRays:
             + """
 variants:
   - {name: plain, filter: tan2022}
-  - {name: all, filter: tan2022, revealed: all}
-  - {name: mask, filter: tan2022, revealed: mask}
+  - {name: all, filter: guertin2014, revealed: all, params: {background: revealed}}
+  - {name: mask, filter: guertin2014, revealed: mask, params: {background: revealed}}
 masks: [ray_mask, hidden]
 mask_params: {tile_size: 20}
 """
@@ -311,10 +314,15 @@ mask_params: {tile_size: 20}
         assert asked.any()
         assert (layer.valid.bool() & ~asked).any()
         masked = dataclasses.replace(layer, valid=layer.valid.bool() & asked)
-        for name, revealed in (("plain", None), ("all", layer), ("mask", masked)):
+        guertin = get_filter("guertin2014")(background="revealed")
+        for name, blur, revealed in (
+            ("plain", get_filter("tan2022")(), None),
+            ("all", guertin, layer),
+            ("mask", guertin, masked),
+        ):
             frame = dataclasses.replace(moment.sharp, revealed=revealed)
             with torch.no_grad():
-                image = get_filter("tan2022")()(frame, **shutter)
+                image = blur(frame, **shutter)
             want = psnr(image, moment.references["center"], mask=asked)
             found = row_of(rows, name).figures["psnr_ray_mask"][0]
             assert found == pytest.approx(float(want), rel=1e-5), name
@@ -444,6 +452,6 @@ class TestRefused:
 
 def test_studies_in_configs_load(repository, tmp_path):
     for file in sorted((repository / "configs" / "studies").glob("*.yaml")):
-        text = file.read_text()
-        overrides = [f"data.{i}.path={tmp_path}" for i in range(text.count("kind: exr"))]
+        kinds = [item["kind"] for item in load_yaml(file)["data"]]
+        overrides = [f"data.{i}.path={tmp_path}" for i, kind in enumerate(kinds) if kind == "exr"]
         assert load_study_config(file, overrides).title
