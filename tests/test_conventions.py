@@ -11,6 +11,8 @@ from torchblur.ops.velocity import half_velocity
 # Filters of streams take no sharp frame: each pixel's time says where it is.
 OF_SHARP_FRAMES = [name for name, kind in registered_filters().items() if "time" not in kind.needs]
 
+pytestmark = pytest.mark.filterwarnings("ignore:tan2022. no layer:UserWarning")
+
 
 def dot_frame(velocity, x=20, y=10, height=21, width=41):
     """One bright pixel that moves alone; its velocity covers a small neighborhood."""
@@ -39,7 +41,7 @@ def test_velocity_is_in_px_per_frame_x_right_y_down_forward_in_time(name):
 
 @pytest.mark.parametrize("name", OF_SHARP_FRAMES)
 def test_centered_shutter_spreads_by_half_its_share_to_both_sides(name):
-    blur = get_filter(name)(shutter=0.5, num_samples=81)
+    blur = get_filter(name)(shutter=0.5, shutter_position="centered", num_samples=81)
     light = blur(dot_frame((32.0, 0.0))).detach()[0, 0, 10]
     lit = (light > 1e-4).nonzero().flatten()
     # V = 0.5 * 32 / 2 = 8 px to each side of the pixel at 20.

@@ -61,6 +61,7 @@ def test_the_second_pass_is_the_filter_on_the_result_of_the_first():
     assert torch.allclose(halves, expected, atol=1e-6)
 
 
+@pytest.mark.filterwarnings("ignore:tan2022. no layer:UserWarning")
 @pytest.mark.parametrize("name", [n for n, f in registered_filters().items() if not f.needs])
 def test_every_filter_of_plain_frames_can_be_wrapped(name):
     frame = random_frame()

@@ -86,10 +86,13 @@ class TwoPassBlur(nn.Module):
         return first | {"color": second["color"], "first_pass": color}
 
     def _second(self, overrides: dict[str, Any]) -> dict[str, Any]:
-        """Return what differs in the second pass: shutter, position and noise."""
+        """Return what differs in the second pass: shutter, position, background and noise."""
         shutter = overrides.get("shutter", self.blur.shutter)
         changed = {"shutter": shutter * self._ratio(overrides), "shutter_position": "centered"}
-        spec = declared(self.blur.config_class).get("seed")
+        specs = declared(self.blur.config_class)
+        if "background" in specs:  # the first pass has put the revealed layer where it belongs
+            changed["background"] = "guessed"
+        spec = specs.get("seed")
         if spec is not None:
             seed = overrides.get("seed", getattr(self.blur.config, "seed", 0))
             changed["seed"] = seed + 1 if seed < spec.bounds[1] else 0
