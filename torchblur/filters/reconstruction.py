@@ -1,4 +1,4 @@
-"""What McGuire 2012 and Guertin 2014 share: parameters, half spreads, the texture of a tap."""
+"""What the gathers share: parameters, half spreads, the texture of a tap."""
 
 from __future__ import annotations
 
