@@ -323,9 +323,10 @@ mask_params: {tile_size: 20}
             frame = dataclasses.replace(moment.sharp, revealed=revealed)
             with torch.no_grad():
                 image = blur(frame, **shutter)
-            want = psnr(image, moment.references["center"], mask=asked)
-            found = row_of(rows, name).figures["psnr_ray_mask"][0]
-            assert found == pytest.approx(float(want), rel=1e-5), name
+            reference, figures = moment.references["center"], row_of(rows, name).figures
+            found = figures["psnr"][0], figures["psnr_ray_mask"][0]
+            want = float(psnr(image, reference)), float(psnr(image, reference, mask=asked))
+            assert found == pytest.approx(want, rel=1e-5), name
 
     @pytest.mark.filterwarnings("ignore:tan2022. no layer `revealed`")
     def test_facts_of_the_mask(self, rays):
