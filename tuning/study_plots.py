@@ -68,7 +68,8 @@ def plot_samples(
             numbers, [v for _, v in curve], "o-", color="#7d8590", label="raw samples", markersize=4
         )
         for index, (name, value) in enumerate(levels.items()):
-            axes.axhline(value, color=color_of(index), linewidth=1.4, label=name)
+            line = "-" if index % 2 == 0 else "--"  # some levels lie upon each other
+            axes.axhline(value, color=color_of(index), linestyle=line, linewidth=1.4, label=name)
         axes.set_xscale("log", base=2)
         axes.set_xticks(numbers, [str(n) for n in numbers])
         axes.set(title=title, xlabel="samples per pixel", ylabel=label)
