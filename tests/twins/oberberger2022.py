@@ -13,6 +13,7 @@ from twins.oberberger2022_pixels import (
     Still,
     Sum,
     at,
+    corners,
     depth_weight,
     is_inside,
     kernel_taps,
@@ -58,12 +59,14 @@ def oberberger2022(frames, history=None, *, times=None, jitter=None, **changes):
     static = [[collected[x, y][1] for x in range(columns)] for y in range(rows)]
     history = remember(moving, static, settings)
     filtered = all_passes(moving, motions, settings)
+    shares = filtered_shares(grids, motions, settings)
 
     planes = {}
     for x, y in everywhere:
         motion, color = motions[y][x], tuple(colors[:, y, x])
         channels = moving[y][x], static[y][x], filtered[y][x]
-        seen = look_at(motion, channels, collected[x, y][3], color, settings)
+        opacities = collected[x, y][3], shares[y][x]
+        seen = look_at(motion, channels, opacities, color, settings)
         seen["reprojection"] = collected[x, y][2]
         seen["prefiltered"] = remodulated(values[0][y][x])
         for name, value in seen.items():
@@ -72,12 +75,15 @@ def oberberger2022(frames, history=None, *, times=None, jitter=None, **changes):
     return planes, history
 
 
-def look_at(motion, channels, first_weights, color, settings):
-    """What is shown of one pixel; 0 where nothing moves nearby."""
+def look_at(motion, channels, opacities, color, settings):
+    """What is shown of one pixel; 0 where nothing moves nearby.
+
+    opacities: weights of the first stage, and the filtered share.
+    """
     moving, static, filtered = channels
     if not motion.active:
-        moving, static = Moving(), Still()
-    alpha = blend_factor(motion, (moving.weight, static.weight), first_weights, settings)
+        moving, static, opacities = Moving(), Still(), ((0.0, 0.0), 0.0)
+    alpha = blend_factor(motion, (moving.weight, static.weight), *opacities, settings)
     black = (0.0, 0.0, 0.0)
     return {
         "color": compose(filtered, static, alpha, color) if motion.active else color,
@@ -358,13 +364,50 @@ def second_stage(channel, x, y, motion, i, settings):
     return Moving.of(total) if total.weight > 0 else channel[y][x]
 
 
+def filtered_shares(grids, motions, settings):
+    """Share of moving samples after the kernels of all passes; None where all are unknown.
+
+    S_0(q) is the share among the pixel's own samples, and S_i(p) = sum h S_i-1(q) / sum h over
+    the taps q of pass i where there is one. Only active pixels are filtered.
+    """
+
+    def own(x, y):
+        known = [grid[y][x].moving for grid in grids if grid[y][x].moving or grid[y][x].still]
+        return sum(known) / len(known) if known else None
+
+    shares = [[own(x, y) for x in range(len(row))] for y, row in enumerate(motions)]
+    for i in range(1, settings.second_stage_iterations + 1):
+        shares = [
+            [
+                filtered_share(shares, x, y, motion, i, settings) if motion.active else shares[y][x]
+                for x, motion in enumerate(row)
+            ]
+            for y, row in enumerate(motions)
+        ]
+    return [[share or 0.0 for share in row] for row in shares]
+
+
+def filtered_share(shares, x, y, motion, i, settings):
+    """The share at (x, y) after pass i."""
+    total = weights = 0.0
+    for o_x, o_y, h in kernel_taps(settings):
+        d_x, d_y = displacement(o_x, o_y, motion, i, settings)
+        for part, share in corners(shares, x + d_x, y + d_y):
+            if share is not None:
+                total += h * part * share
+                weights += h * part
+    return total / weights if weights > 0 else shares[y][x]
+
+
 # -- composition -------------------------------------------------------------------------------
 
 
-def blend_factor(motion, weights, first_weights, settings):
+def blend_factor(motion, weights, first_weights, filtered, settings):
     """Opacity of the moving channel; weights: (moving, static), with history and without."""
     if settings.blend_source == "variance":
         return sat(settings.blend_gain * motion.moving_part)
+    if settings.blend_source == "filtered":
+        return filtered
     moving, static = weights if settings.blend_source == "weights" else first_weights
     return moving / (moving + static) if moving + static > 0 else 0.0
 

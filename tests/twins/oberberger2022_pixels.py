@@ -195,19 +195,28 @@ def is_inside(grid, x, y):
     return 0 <= y < len(grid) and 0 <= x < len(grid[0])
 
 
-def bilinear(channel, x, y):
-    """(valid part, mean data of it, place) between the four pixels around (x, y)."""
-    x, y = clamp(x, 0, len(channel[0]) - 1), clamp(y, 0, len(channel) - 1)
-    total = Sum()
+def corners(grid, x, y):
+    """(part, pixel) of each of the four pixels around (x, y); a whole position is one pixel."""
+    x, y = clamp(x, 0, len(grid[0]) - 1), clamp(y, 0, len(grid) - 1)
+    found = []
     for row in (math.floor(y), math.floor(y) + 1):
         for column in (math.floor(x), math.floor(x) + 1):
-            b = (1 - abs(x - column)) * (1 - abs(y - row))
-            pixel, _ = at(channel, column, row)
-            if pixel.weight > 0:
-                total.add(b, pixel.data())
+            part = (1 - abs(x - column)) * (1 - abs(y - row))
+            if part > 0:
+                found.append((part, grid[row][column]))
+    return found
+
+
+def bilinear(channel, x, y):
+    """(valid part, mean data of it, place) between the four pixels around (x, y)."""
+    total = Sum()
+    for part, pixel in corners(channel, x, y):
+        if pixel.weight > 0:
+            total.add(part, pixel.data())
+    place = clamp(x, 0, len(channel[0]) - 1), clamp(y, 0, len(channel) - 1)
     if total.weight <= LEAST:
-        return 0.0, None, (x, y)
-    return total.weight, total.mean(), (x, y)
+        return 0.0, None, place
+    return total.weight, total.mean(), place
 
 
 def moving_at(channel, x, y, settings):

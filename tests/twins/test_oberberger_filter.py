@@ -32,6 +32,8 @@ CASES = [
         "second_stage_iterations": 2,
         "lookup": "bilinear",
     },
+    SMALL | {"blend_source": "filtered", "variance_stride": 3},
+    SMALL | {"blend_source": "filtered", "lookup": "bilinear", "kernel": "box", "min_step": 0.3},
     SMALL | {"demodulate": True, "albedo_floor": 0.1, "angle_normalization": 0.5},
 ]
 
@@ -155,12 +157,12 @@ def test_filter_equals_its_twin(params):
     assert_equal(run_both(params))
 
 
-@pytest.mark.parametrize("params", [CASES[0], CASES[2], CASES[6], CASES[9]], ids=str)
+@pytest.mark.parametrize("params", [CASES[i] for i in (0, 2, 6, 9, 13)], ids=str)
 def test_filter_equals_its_twin_with_two_samples_per_pixel(params):
     assert_equal(run_both(params, samples=2, frames=2))
 
 
-@pytest.mark.parametrize("params", [CASES[5], CASES[9]], ids=str)
+@pytest.mark.parametrize("params", [CASES[i] for i in (5, 9, 13, 14)], ids=str)
 def test_filter_equals_its_twin_where_pixels_cannot_be_trusted(params):
     assert_equal(run_both(params, invalid=0.2, frames=2))
 

@@ -181,15 +181,40 @@ def test_composition():
 def test_opacity():
     motion = Motion(1.0, moving_part=0.3)
     opacities = [
-        ob.blend_factor(motion, (1, 3), (2, 3), settings_of(changes))
+        ob.blend_factor(motion, (1, 3), (2, 3), 0.7, settings_of(changes))
         for changes in (
             {"blend_gain": 2.0},
             {"blend_gain": 4.0},
             {"blend_source": "weights"},
             {"blend_source": "first_stage"},
+            {"blend_source": "filtered"},
         )
     ]
-    assert opacities == pytest.approx([0.6, 1, 0.25, 0.4])
+    assert opacities == pytest.approx([0.6, 1, 0.25, 0.4, 0.7])
+
+
+def test_filtered_share_of_a_moving_stretch():
+    """Two passes of an unturned kernel over a row, steps 1 and 2 px, by hand."""
+    settings = settings_of(
+        {"second_stage_iterations": 2, "kernel_scaling": "fixed", "lookup": "nearest"}
+    )
+    moves = np.array([0, 0, 0, 0, 0, 0, 1, 1, 1, 1, 1, 0, 0, 0, 0, 0, 0], float)
+    kinds = [SimpleNamespace(moving=m > 0, still=m == 0) for m in moves]
+    motions = [[Motion(length=6.0)] * len(moves)]
+    taps = np.array([1, 4, 6, 4, 1]) / 16
+    once = np.convolve(moves, taps, "same")
+    twice = np.convolve(once, np.array([1, 0, 4, 0, 6, 0, 4, 0, 1]) / 16, "same")
+    (shares,) = ob.filtered_shares([[kinds]], motions, settings)
+    np.testing.assert_allclose(shares, twice)
+    # A second sample per pixel that never moves halves it; unknown ones do not count.
+    still = [SimpleNamespace(moving=False, still=True) for _ in moves]
+    unknown = [SimpleNamespace(moving=False, still=False) for _ in moves]
+    (half,) = ob.filtered_shares([[kinds], [still], [unknown]], motions, settings)
+    np.testing.assert_allclose(half, twice / 2)
+    # Pixels that are not filtered keep their own share.
+    calm = [[Motion(length=6.0 if x < 8 else 0.0) for x in range(len(moves))]]
+    (shares,) = ob.filtered_shares([[kinds]], calm, settings)
+    np.testing.assert_allclose(shares[8:], moves[8:])
 
 
 def test_nothing_moves(rng):

@@ -61,9 +61,9 @@ class Oberberger2022Config(FilterConfig):
         grad="discrete", source=f"px: {_VARIANCE}; mean: {_OURS}",
         meaning="variance of the length in px², or over the mean length squared",
     )] = "px"
-    blend_source: Annotated[Literal["variance", "weights", "first_stage"], Param(
+    blend_source: Annotated[Literal["variance", "weights", "first_stage", "filtered"], Param(
         grad="discrete", source=f"{_unstated(_VARIANCE)}; others: {_OURS}",
-        meaning="opacity of moving: its share of the window, or of weights with or without history",
+        meaning="opacity of moving: its share of the window, of weights, or along the motion",
     )] = "variance"
     blend_gain: Annotated[float, Param(
         low=0.1, high=10.0, scale="log", grad="smooth", source=_unstated(_VARIANCE),

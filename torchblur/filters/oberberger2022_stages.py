@@ -11,6 +11,7 @@ from torchblur.filters.base import History, Values
 from torchblur.frame import Frame
 from torchblur.ops.atrous import (
     Centers,
+    Footprint,
     Samples,
     Sums,
     Widths,
@@ -254,7 +255,7 @@ def accumulate(scene: Scene, sums: Sums, past: Past) -> tuple[Sums, Tensor]:
     place = chosen[0].nonzero()[:, 0]
     outcome = outcome.index_copy(1, some[0].nonzero()[:, 0], found.outcome)
     static = torch.cat((past.planes["static"], past.planes["static_weight"]), 1)
-    still = plain_sums(static, points, taps, _keep(scene), engine)
+    still = plain_sums(static, points, taps, _keep(scene), engine=engine)
     return (
         Sums(
             sums.moving.index_add(1, place, added[0]),
@@ -272,32 +273,41 @@ def _among(value: Tensor, chosen: Tensor) -> Tensor:
 
 def second_stage(scene: Scene, sums: Sums) -> tuple[Tensor, Tensor]:
     """Return the filtered moving channel (C + 3, N) and where it is valid (1, N)."""
-    points, guide, values = scene.points, scene.guide, scene.values
+    points, values = scene.points, scene.values
     moving = mean_of(sums.moving, sums.moving_weight)
     valid = (sums.moving_weight > 0).to(moving.dtype)
     taps = kernel_taps(values.kernel, moving)
     shutter = per_point(values.shutter, points, moving)
-    number = values.second_stage_iterations
-    for turn in range(1, number + 1):
-        if values.kernel_scaling == "fixed":
-            one = torch.ones_like(guide.length)
-            step = one * 2.0 ** (turn - 1)
-            shape = footprint(None, step, one, one, torch.zeros_like(one))
-        else:
-            shape = footprint(
-                guide.angle if values.kernel_rotation else None,
-                guide.length,
-                guide.angle_variance,
-                per_point(values.step_divisor, points, moving) * 2 ** (number - turn),
-                per_point(values.min_step, points, moving),
-            )
+    for turn in range(1, values.second_stage_iterations + 1):
         texture = put(torch.cat((moving, shutter * moving[-3:-1], valid)), points)
         sum_, weight = path_sums(
-            texture, points, taps, guide.widths, shape, values.lookup, scene.engine
+            texture,
+            points,
+            taps,
+            scene.guide.widths,
+            _footprint_of(scene, turn),
+            values.lookup,
+            scene.engine,
         )
         moving = torch.where(weight > 0, mean_of(sum_, weight), moving)
         valid = torch.where(weight > 0, 1.0, valid)
     return moving, valid
+
+
+def _footprint_of(scene: Scene, turn: int) -> Footprint:
+    """Return how the kernel lies in pass 1 to n of the second stage."""
+    points, guide, values = scene.points, scene.guide, scene.values
+    if values.kernel_scaling == "fixed":
+        one = torch.ones_like(guide.length)
+        return footprint(None, one * 2.0 ** (turn - 1), one, one, torch.zeros_like(one))
+    return footprint(
+        guide.angle if values.kernel_rotation else None,
+        guide.length,
+        guide.angle_variance,
+        per_point(values.step_divisor, points, guide.length)
+        * 2 ** (values.second_stage_iterations - turn),
+        per_point(values.min_step, points, guide.length),
+    )
 
 
 def opacity(scene: Scene, first: Sums, sums: Sums) -> Tensor:
@@ -305,8 +315,27 @@ def opacity(scene: Scene, first: Sums, sums: Sums) -> Tensor:
     share, values = scene.guide.share, scene.values
     if values.blend_source == "variance":
         return saturate(per_point(values.blend_gain, scene.points, share) * share)
+    if values.blend_source == "filtered":
+        return _filtered_share(scene)
     chosen = sums if values.blend_source == "weights" else first
     return mean_of(chosen.moving_weight, chosen.moving_weight + chosen.static_weight)
+
+
+def _filtered_share(scene: Scene) -> Tensor:
+    """Return the share of moving samples under the kernels of the second stage, (1, N)."""
+    points, values = scene.points, scene.values
+    moving = torch.stack([sample.moving for sample in scene.samples]).sum(0)
+    trusted = moving + torch.stack([sample.static for sample in scene.samples]).sum(0)
+    mask = torch.cat((mean_of(moving, trusted), (trusted > 0).to(moving.dtype)), 1)
+    taps = kernel_taps(values.kernel, moving)
+    nowhere = torch.zeros_like(points.x)
+    for turn in range(1, values.second_stage_iterations + 1):
+        shape = _footprint_of(scene, turn)
+        sum_, weight = plain_sums(mask, points, taps, nowhere, shape, values.lookup, scene.engine)
+        some = weight > 0
+        now = torch.cat((mean_of(sum_, weight), some.to(moving.dtype)))
+        mask = put(torch.where(some, now, take(mask, points)), points, mask)
+    return take(mask, points)[:1]
 
 
 def compose(sums: Sums, second: Tensor, valid: Tensor, blend: Tensor, given: Tensor) -> Tensor:

@@ -195,6 +195,11 @@ def footprint(
     return Footprint(turn.cos(), turn.sin(), step_x, step_y)
 
 
+def _unit(points: Points) -> Footprint:
+    one, zero = torch.ones_like(points.x), torch.zeros_like(points.x)
+    return Footprint(one, zero, one, one)
+
+
 class _Path(NamedTuple):
     lookup: Lookup
 
@@ -231,8 +236,7 @@ def path_sums(
     Reference: Oberberger 2022, sections 4.3 and 4.4.
     """
     if shape is None:
-        one, zero = torch.ones_like(points.x), torch.zeros_like(points.x)
-        shape = Footprint(one, zero, one, one)
+        shape = _unit(points)
     if lookup == "bilinear":
         texture = torch.cat((texture[:, :-1] * texture[:, -1:], texture[:, -1:]), 1)
     inputs = {"texture": flat(texture), "taps": taps}
@@ -241,11 +245,16 @@ def path_sums(
     return values, weight
 
 
-def _path_tap(index: Tensor, count: Tensor, inputs: Inputs, options: _Path) -> tuple[Tensor, ...]:
-    i, j, share = inputs["taps"].index_select(0, index.long().reshape(1))[0]
+def _displaced(i: Tensor, j: Tensor, inputs: Inputs) -> tuple[Tensor, Tensor]:
+    """Return how far from the center a tap of a turned and stretched kernel lies, px."""
     along, across = i * inputs["step_x"], j * inputs["step_y"]
     dx = inputs["cos"] * along - inputs["sin"] * across
-    dy = inputs["sin"] * along + inputs["cos"] * across
+    return dx, inputs["sin"] * along + inputs["cos"] * across
+
+
+def _path_tap(index: Tensor, count: Tensor, inputs: Inputs, options: _Path) -> tuple[Tensor, ...]:
+    i, j, share = inputs["taps"].index_select(0, index.long().reshape(1))[0]
+    dx, dy = _displaced(i, j, inputs)
     if options.lookup == "nearest":
         row, x, y = nearest_index(inputs["x"] + dx.round(), inputs["y"] + dy.round(), inputs)
         planes = inputs["texture"].index_select(1, row)
@@ -277,7 +286,13 @@ def _bilinear(x: Tensor, y: Tensor, inputs: Inputs) -> tuple[Tensor, Tensor, Ten
 
 
 def plain_sums(
-    texture: Tensor, points: Points, taps: Tensor, keep: Tensor, engine: Engine = "eager"
+    texture: Tensor,
+    points: Points,
+    taps: Tensor,
+    keep: Tensor,
+    shape: Footprint | None = None,
+    lookup: Lookup = "nearest",
+    engine: Engine = "eager",
 ) -> tuple[Tensor, Tensor]:
     """Return sums over the kernel with the weights ``h W(q)``, without any other test.
 
@@ -286,24 +301,35 @@ def plain_sums(
         points: The pixels to filter.
         taps: From `kernel_taps`.
         keep: 1 where only the pixel itself counts, with ``W``, else 0, (1, N).
+        shape: How the kernel is turned and stretched; None: not at all.
+        lookup: As in `path_sums`.
         engine: See `ops.gather`.
 
     Returns:
         Sums of the values (K, N) and of the weights (1, N).
 
-    Differentiable: in the texture.
+    Differentiable: in the texture; in the footprint with "bilinear" only.
     Border: replicated.
-    Reference: Oberberger 2022, section 4.4 (the static channel of the history).
+    Reference: Oberberger 2022, section 4.4 (the static channel of the history); with a footprint
+        ours, for the opacity.
     """
-    inputs = points.inputs() | {"texture": flat(texture), "taps": taps, "keep": keep}
-    values, weight = gather(_plain_tap, None, taps.shape[0], inputs, engine)
+    if shape is None:
+        shape = _unit(points)
+    texture = torch.cat((texture[:, :-1] * texture[:, -1:], texture[:, -1:]), 1)
+    inputs = {"texture": flat(texture), "taps": taps, "keep": keep}
+    inputs |= points.inputs() | shape._asdict()
+    values, weight = gather(_plain_tap, _Path(lookup), taps.shape[0], inputs, engine)
     return values, weight
 
 
-def _plain_tap(index: Tensor, count: Tensor, inputs: Inputs, options: None) -> tuple[Tensor, ...]:
-    ox, oy, share = inputs["taps"].index_select(0, index.long().reshape(1))[0]
-    row, _, _ = nearest_index(inputs["x"] + ox, inputs["y"] + oy, inputs)
-    planes = inputs["texture"].index_select(1, row)
-    middle = ((ox == 0) & (oy == 0)).to(planes.dtype)
-    weight = planes[-1:] * torch.where(inputs["keep"] > 0, middle, share)
-    return weight * planes[:-1], weight
+def _plain_tap(index: Tensor, count: Tensor, inputs: Inputs, options: _Path) -> tuple[Tensor, ...]:
+    i, j, share = inputs["taps"].index_select(0, index.long().reshape(1))[0]
+    dx, dy = _displaced(i, j, inputs)
+    if options.lookup == "nearest":
+        row, _, _ = nearest_index(inputs["x"] + dx.round(), inputs["y"] + dy.round(), inputs)
+        planes = inputs["texture"].index_select(1, row)
+    else:
+        planes, _, _ = _bilinear(inputs["x"] + dx, inputs["y"] + dy, inputs)
+    middle = ((i == 0) & (j == 0)).to(planes.dtype)
+    planes = planes * torch.where(inputs["keep"] > 0, middle, share)
+    return planes[:-1], planes[-1:]
