@@ -331,18 +331,21 @@ def add_static_history(static, history, p, keeps_own, settings):
 # -- 4.3 second stage --------------------------------------------------------------------------
 
 
-def kernel_steps(motion, i, settings):
-    """(s_x, s_y) of iteration i = 1 .. n: steps along the motion and across it, in px."""
+def kernel_steps(motion, i, settings, across=1.0):
+    """(s_x, s_y) of iteration i = 1 .. n: steps along the motion and across it, in px.
+
+    across: the step across a motion that has one angle.
+    """
     if settings.kernel_scaling == "fixed":
         return 2.0 ** (i - 1), 2.0 ** (i - 1)
     n = settings.second_stage_iterations
     along = max(settings.min_step, motion.length / (settings.step_divisor * 2 ** (n - i)))
-    return along, 1 + motion.angle_variance * (along - 1)
+    return along, (1 - motion.angle_variance) * across + motion.angle_variance * along
 
 
-def displacement(o_x, o_y, motion, i, settings):
+def displacement(o_x, o_y, motion, i, settings, across=1.0):
     """Where tap (o_x, o_y) lies, in px from the center of the kernel."""
-    s_x, s_y = kernel_steps(motion, i, settings)
+    s_x, s_y = kernel_steps(motion, i, settings, across)
     x, y = o_x * s_x, o_y * s_y
     if settings.kernel_rotation and settings.kernel_scaling == "motion":
         cosine, sine = math.cos(motion.angle), math.sin(motion.angle)
@@ -368,7 +371,8 @@ def filtered_shares(grids, motions, settings):
     """Share of moving samples after the kernels of all passes; None where all are unknown.
 
     S_0(q) is the share among the pixel's own samples, and S_i(p) = sum h S_i-1(q) / sum h over
-    the taps q of pass i where there is one. Only active pixels are filtered.
+    the taps q of pass i where there is one. Where all motion has one angle, the taps lie on a
+    line. Only active pixels are filtered.
     """
 
     def own(x, y):
@@ -391,7 +395,7 @@ def filtered_share(shares, x, y, motion, i, settings):
     """The share at (x, y) after pass i."""
     total = weights = 0.0
     for o_x, o_y, h in kernel_taps(settings):
-        d_x, d_y = displacement(o_x, o_y, motion, i, settings)
+        d_x, d_y = displacement(o_x, o_y, motion, i, settings, across=0.0)
         for part, share in corners(shares, x + d_x, y + d_y):
             if share is not None:
                 total += h * part * share

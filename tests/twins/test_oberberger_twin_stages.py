@@ -211,6 +211,15 @@ def test_filtered_share_of_a_moving_stretch():
     unknown = [SimpleNamespace(moving=False, still=False) for _ in moves]
     (half,) = ob.filtered_shares([[kinds], [still], [unknown]], motions, settings)
     np.testing.assert_allclose(half, twice / 2)
+    # Scaled by the motion, nothing beside its way counts, unless it has many angles.
+    scaled = settings_of({"second_stage_iterations": 1})
+    beside = [kinds, still, kinds]
+    rows = [[motion] * len(moves) for motion in (Motion(length=10.0),) * 3]
+    (_, shares, _) = ob.filtered_shares([beside], rows, scaled)
+    np.testing.assert_allclose(shares, 0)
+    rows = [[motion] * len(moves) for motion in (Motion(length=10.0, angle_variance=1.0),) * 3]
+    (_, shares, _) = ob.filtered_shares([beside], rows, scaled)
+    assert 0.3 < shares[8] < 0.7
     # Pixels that are not filtered keep their own share.
     calm = [[Motion(length=6.0 if x < 8 else 0.0) for x in range(len(moves))]]
     (shares,) = ob.filtered_shares([[kinds]], calm, settings)

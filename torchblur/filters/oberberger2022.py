@@ -78,18 +78,19 @@ class Oberberger2022Blur(TemporalBlur):
     bit. Depth tests are ramps over `depth_extent`. The opacity of the moving channel is the share
     of moving samples in the window, which leaves a rim around what moves. `blend_source` has
     others, ours. "filtered", the best, is the share of moving samples under the kernels of all
-    passes of the second stage, weighted by ``h`` alone. "first_stage" is the moving share of the
-    weights of the first stage: noisy, and too low, as ``w`` takes from the moving ones alone.
-    "weights" is the same with the history added; use it without one, as the still weight then
-    grows more than the moving one, and what moves fades from frame to frame. The kernel is a B3
-    spline. Steps of the second stage have a floor of `min_step`, and its passes filter color,
-    velocity and time together. The weight of the history is limited. Sums at the border count the
-    border's pixels where they are, as often as they are met. Several samples per pixel (a list of
-    frames) are summed; the first one decides what the pixel itself is. With `demodulate` the light
-    (color over albedo) and the albedo are filtered with the same weights and multiplied in each
-    channel before the channels are laid over each other. Random samples follow from `seed`, the
-    number of frames since the shot began, and the number of the sample: `random_candidates` with
-    the stream ``1024 · frame + sample``; all images of a batch get the same.
+    passes of the second stage, weighted by ``h`` alone, with ``s_y = lerp(0, s_x, σ²_θ)``.
+    "first_stage" is the moving share of the weights of the first stage: noisy, and too low, as
+    ``w`` takes from the moving ones alone. "weights" is the same with the history added; use it
+    without one, as the still weight then grows more than the moving one, and what moves fades from
+    frame to frame. The kernel is a B3 spline. Steps of the second stage have a floor of
+    `min_step`, and its passes filter color, velocity and time together. The weight of the history
+    is limited. Sums at the border count the border's pixels where they are, as often as they are
+    met. Several samples per pixel (a list of frames) are summed; the first one decides what the
+    pixel itself is. With `demodulate` the light (color over albedo) and the albedo are filtered
+    with the same weights and multiplied in each channel before the channels are laid over each
+    other. Random samples follow from `seed`, the number of frames since the shot began, and the
+    number of the sample: `random_candidates` with the stream ``1024 · frame + sample``; all images
+    of a batch get the same.
 
     `layers` adds, (B, 1, H, W) if nothing else is said and 0 where nothing moves nearby:
     "mean_length" (px), "mean_angle" (radians, y down), "length_variance" (px², or relative with

@@ -294,7 +294,7 @@ def second_stage(scene: Scene, sums: Sums) -> tuple[Tensor, Tensor]:
     return moving, valid
 
 
-def _footprint_of(scene: Scene, turn: int) -> Footprint:
+def _footprint_of(scene: Scene, turn: int, across: float = 1.0) -> Footprint:
     """Return how the kernel lies in pass 1 to n of the second stage."""
     points, guide, values = scene.points, scene.guide, scene.values
     if values.kernel_scaling == "fixed":
@@ -307,6 +307,7 @@ def _footprint_of(scene: Scene, turn: int) -> Footprint:
         per_point(values.step_divisor, points, guide.length)
         * 2 ** (values.second_stage_iterations - turn),
         per_point(values.min_step, points, guide.length),
+        across,
     )
 
 
@@ -322,7 +323,10 @@ def opacity(scene: Scene, first: Sums, sums: Sums) -> Tensor:
 
 
 def _filtered_share(scene: Scene) -> Tensor:
-    """Return the share of moving samples under the kernels of the second stage, (1, N)."""
+    """Return the share of moving samples under the kernels of the second stage, (1, N).
+
+    Nothing here keeps taps beside the way of p out, so where all moves one way they lie on it.
+    """
     points, values = scene.points, scene.values
     moving = torch.stack([sample.moving for sample in scene.samples]).sum(0)
     trusted = moving + torch.stack([sample.static for sample in scene.samples]).sum(0)
@@ -330,7 +334,7 @@ def _filtered_share(scene: Scene) -> Tensor:
     taps = kernel_taps(values.kernel, moving)
     nowhere = torch.zeros_like(points.x)
     for turn in range(1, values.second_stage_iterations + 1):
-        shape = _footprint_of(scene, turn)
+        shape = _footprint_of(scene, turn, across=0.0)
         sum_, weight = plain_sums(mask, points, taps, nowhere, shape, values.lookup, scene.engine)
         some = weight > 0
         now = torch.cat((mean_of(sum_, weight), some.to(moving.dtype)))

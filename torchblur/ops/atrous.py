@@ -173,11 +173,16 @@ class Footprint(NamedTuple):
 
 
 def footprint(
-    angle: Tensor | None, length: Tensor, angle_variance: Tensor, divisor: Tensor, least: Tensor
+    angle: Tensor | None,
+    length: Tensor,
+    angle_variance: Tensor,
+    divisor: Tensor,
+    least: Tensor,
+    across: float = 1.0,
 ) -> Footprint:
     """Return the kernel of one pass of the second stage: along the motion, as long as it.
 
-    ``s_x = max(least, l / divisor)``, ``s_y = lerp(1, s_x, σ²_θ)``.
+    ``s_x = max(least, l / divisor)``, ``s_y = lerp(across, s_x, σ²_θ)``.
 
     Args:
         angle: Mean angle of the motion, radians, (1, N); None does not turn the kernel.
@@ -185,12 +190,13 @@ def footprint(
         angle_variance: σ²_θ in [0, 1], (1, N).
         divisor: 5 · 2^(n−i) for pass i of n.
         least: Least step along the motion, px.
+        across: Step across a motion of one angle, px; 0 makes a line of the kernel.
 
     Reference: Oberberger 2022, section 4.3, Second Stage. We differ: the least step, without
         which all taps of slow motion fall on the pixel itself; 0 is the text's way.
     """
     step_x = torch.maximum(length / divisor, torch.as_tensor(least).expand_as(length))
-    step_y = 1 + (step_x - 1) * angle_variance
+    step_y = across + (step_x - across) * angle_variance
     turn = torch.zeros_like(length) if angle is None else angle
     return Footprint(turn.cos(), turn.sin(), step_x, step_y)
 
