@@ -1,69 +1,7 @@
-import subprocess
-import sys
-
 import pytest
 import torch
 
-from torchblur.errors import ConfigError
-from torchblur.ops.gather import gather, lookup, pixel_grid
-
-
-def tap(index, count, inputs, options):
-    x, y = pixel_grid(inputs["image"])
-    color = lookup(inputs["image"], x + index * inputs["step"], y, options)
-    weight = torch.exp(-inputs["decay"] * index / count)
-    return weight * color, weight.expand_as(color[:, :1])
-
-
-def unrolled(inputs, num_samples, options):
-    parts = [
-        tap(
-            torch.tensor(float(i), dtype=inputs["image"].dtype),
-            torch.tensor(float(num_samples)),
-            inputs,
-            options,
-        )
-        for i in range(num_samples)
-    ]
-    return tuple(sum(p) for p in zip(*parts, strict=True))
-
-
-def make_inputs(dtype=torch.float64):
-    return {
-        "image": torch.rand(2, 3, 5, 9, dtype=dtype),
-        "step": torch.tensor(0.37, dtype=dtype),
-        "decay": torch.rand(2, 1, 1, 1, dtype=dtype) + 0.5,
-    }
-
-
-@pytest.mark.parametrize("mode", ["nearest", "bilinear"])
-def test_gather_equals_the_unrolled_sum_and_its_gradient(mode):
-    inputs = make_inputs()
-    results = []
-    for run in (lambda i: gather(tap, mode, 6, i), lambda i: unrolled(i, 6, mode)):
-        leaves = {k: v.clone().requires_grad_() for k, v in inputs.items()}
-        color, weight = run(leaves)
-        (color / weight).square().sum().backward()
-        grads = [v.grad if v.grad is not None else torch.zeros_like(v) for v in leaves.values()]
-        results.append([color, weight, *grads])
-    for ours, theirs in zip(*results, strict=True):
-        assert torch.allclose(ours, theirs, atol=1e-10)
-
-
-def test_only_what_needs_a_gradient_gets_one():
-    inputs = make_inputs()
-    inputs["decay"].requires_grad_()
-    color, _ = gather(tap, "nearest", 4, inputs)
-    color.sum().backward()
-    assert inputs["decay"].grad is not None
-    assert inputs["image"].grad is None
-    with torch.no_grad():
-        assert not gather(tap, "nearest", 4, inputs)[0].requires_grad
-
-
-def test_unknown_engine():
-    with pytest.raises(ConfigError, match="`engine` must be 'eager' or 'compiled', got 'fast'"):
-        gather(tap, "nearest", 4, make_inputs(), "fast")
+from torchblur.ops.gather import gather, lookup, pixel_grid, read, weighted
 
 
 @pytest.mark.parametrize("mode", ["nearest", "bilinear"])
@@ -81,69 +19,84 @@ def test_lookup_of_a_batch_with_positions_of_one():
     assert torch.equal(lookup(texture, x, y), texture)
 
 
-_NO_COMPILER = """
-import warnings, torch
-import torch._inductor.compile_fx
-from torch._inductor.exc import InductorError
-import torchblur.ops.gather as module
-
-def broken(*_, **__):
-    def call(*_, **__):
-        raise InductorError(RuntimeError("no C++ compiler"), None)
-    return call
-
-torch.compile = broken
-from torchblur.filters import get_filter
-from torchblur.testing.frames import moving_square
-frame = moving_square()
-with warnings.catch_warnings(record=True) as caught:
-    warnings.simplefilter("always")
-    blur = get_filter("line")(engine="compiled")
-    images = [blur(frame) for _ in range(3)]
-assert torch.equal(images[0], get_filter("line")()(frame))
-texts = [str(w.message) for w in caught if "torch.compile does not work here" in str(w.message)]
-assert len(texts) == 1, texts
-"""
+def tap(index, count, inputs, options):
+    x, y = inputs["x"] + index * inputs["step"] + 0.11, inputs["y"] + 0.3 * index + 0.07
+    weight = torch.exp(-inputs["decay"] * index / count)
+    return weighted(weight, read(inputs, x, y, options)), weight + 0 * x
 
 
-def test_without_a_compiler_there_is_one_notice_and_the_eager_result():
-    done = subprocess.run(
-        [sys.executable, "-c", _NO_COMPILER], capture_output=True, text=True, check=False
-    )
-    assert done.returncode == 0, done.stderr
+def make_inputs(batch_size=1, sets=1, dtype=torch.float64):
+    generator = torch.Generator().manual_seed(3)
+    image = torch.rand(batch_size, 3, 5, 9, dtype=dtype, generator=generator)
+    x, y = pixel_grid(image)
+    return {
+        "texture": image,
+        "x": x,
+        "y": y,
+        "step": torch.tensor(0.37, dtype=dtype),
+        "decay": torch.rand(max(sets, batch_size), 1, 1, 1, dtype=dtype, generator=generator),
+    }
 
 
-def peak_tap(index, count, inputs, options):
-    x, y = pixel_grid(inputs["image"])
-    color = lookup(inputs["image"], x + index * inputs["step"], y, options)
-    return color, color * inputs["decay"]
+def expected(inputs, num_samples, mode):
+    color = weight = 0.0
+    for i in range(num_samples):
+        w = torch.exp(-inputs["decay"] * i / num_samples)
+        x, y = inputs["x"] + i * inputs["step"] + 0.11, inputs["y"] + 0.3 * i + 0.07
+        color = color + w * lookup(inputs["texture"], x, y, mode)
+        weight = weight + w.expand(-1, -1, 5, 9)
+    return color, weight
 
 
-@pytest.mark.parametrize("num_maxima", [0, 1, 2])
-def test_the_last_accumulators_can_be_maxima(num_maxima):
-    inputs = make_inputs() | {"step": torch.tensor(1.0, dtype=torch.float64)}
+@pytest.mark.parametrize("mode", ["nearest", "bilinear"])
+@pytest.mark.parametrize(("batch_size", "sets"), [(1, 1), (3, 1), (1, 4)])
+@pytest.mark.parametrize("share", [None, 0.0, 0.3, 1.0])
+def test_lists_of_pixels_give_what_images_give(mode, batch_size, sets, share):
+    inputs = make_inputs(batch_size, sets)
+    active = None
+    if share is not None:
+        active = torch.rand(batch_size, 1, 5, 9, generator=torch.Generator().manual_seed(1)) < share
     results = []
-    for by_engine in (True, False):
+    for run in (lambda i: gather(tap, mode, 6, i, active=active), lambda i: expected(i, 6, mode)):
         leaves = {k: v.clone().requires_grad_() for k, v in inputs.items()}
-        if by_engine:
-            totals = gather(peak_tap, "nearest", 6, leaves, num_maxima=num_maxima)
-        else:
-            parts = [
-                peak_tap(torch.tensor(float(i)).double(), None, leaves, "nearest") for i in range(6)
-            ]
-            stacked = [torch.stack(p) for p in zip(*parts, strict=True)]
-            totals = [s.sum(0) if i < 2 - num_maxima else s.amax(0) for i, s in enumerate(stacked)]
-        # Border pixels are met more than once: how amax divides a tie is not our affair.
-        sum(t[..., :4].square().sum() for t in totals).backward()
-        results.append([*totals, leaves["image"].grad, leaves["decay"].grad])
+        wanted = 1.0 if active is None else active.double()
+        color, weight = (plane * wanted for plane in run(leaves))
+        (color.square().sum() + (weight.sin() * color).sum()).backward()
+        grads = [v.grad if v.grad is not None else torch.zeros_like(v) for v in leaves.values()]
+        results.append([color, weight, *grads])
     for ours, theirs in zip(*results, strict=True):
         assert torch.allclose(ours, theirs, atol=1e-10)
 
 
-def test_a_tied_maximum_gives_its_gradient_to_one_tap():
-    image = torch.ones(1, 1, 2, 3, dtype=torch.float64)
-    leaves = {"image": image, "step": image.new_tensor(1.0)}
-    leaves["decay"] = image.new_tensor(2.0).requires_grad_()
-    _, peak = gather(peak_tap, "nearest", 5, leaves, num_maxima=1)
-    peak.sum().backward()
-    assert float(leaves["decay"].grad) == 6.0
+def test_what_is_not_active_is_zero_and_not_computed():
+    seen = []
+
+    def counting(index, count, inputs, options):
+        seen.append(inputs["x"].shape[-1])
+        return read(inputs, inputs["x"], inputs["y"]), inputs["x"]
+
+    inputs = make_inputs()
+    active = torch.zeros(1, 1, 5, 9, dtype=torch.bool)
+    active[..., 2, 4:7] = True
+    color, _ = gather(counting, None, 2, inputs, active=active)
+    assert set(seen) == {3}
+    assert torch.equal(color[..., 2, 4:7], 2 * inputs["texture"][..., 2, 4:7])
+    assert not color[..., 0, :].any()
+
+
+def test_one_kernel_serves_all_sizes_batches_and_shares_of_active_pixels():
+    inputs = make_inputs(dtype=torch.float32)
+    gather(tap, "nearest", 3, inputs, "compiled")
+    before = torch._dynamo.utils.counters["stats"]["unique_graphs"]
+    few = torch.zeros(1, 1, 5, 9, dtype=torch.bool)
+    few[..., 1:3, 2:6] = True
+    for given, active in ((inputs, few), (make_inputs(1, dtype=torch.float32), None)):
+        result = gather(tap, "nearest", 5, given, "compiled", active=active)
+        assert torch.allclose(result[0], gather(tap, "nearest", 5, given, active=active)[0])
+    batch = make_inputs(3, dtype=torch.float32) | {"decay": torch.tensor(0.4)}
+    one = make_inputs(dtype=torch.float32) | {"decay": torch.tensor(0.4)}
+    gather(tap, "nearest", 3, one, "compiled")
+    assert torch._dynamo.utils.counters["stats"]["unique_graphs"] == before
+    result = gather(tap, "nearest", 3, batch, "compiled")
+    assert torch.allclose(result[0], gather(tap, "nearest", 3, batch)[0])
+    assert torch._dynamo.utils.counters["stats"]["unique_graphs"] == before

@@ -22,7 +22,7 @@ from torchblur.filters.reconstruction import (
 from torchblur.filters.revealed import RevealedBackgroundConfig, revealed_inputs
 from torchblur.frame import Frame, Shutter
 from torchblur.ops.color import luma
-from torchblur.ops.gather import Engine, Inputs, Lookup, gather, pixel_grid
+from torchblur.ops.gather import Engine, Inputs, Lookup, Planes, gather, pixel_grid, weighted
 from torchblur.ops.noise import checkerboard, noise_plane
 from torchblur.ops.tiles import tile_lookup, tile_offset, tile_variance
 from torchblur.ops.velocity import direction, length
@@ -318,7 +318,7 @@ def _luma(frame: Frame, moving: Tensor, kind: str, color: Tensor) -> Tensor:
     return torch.where(moving, checkerboard(true), true)
 
 
-def _tap(index: Tensor, count: Tensor, inputs: Inputs, options: _Options) -> tuple[Tensor, ...]:
+def _tap(index: Tensor, count: Tensor, inputs: Inputs, options: _Options) -> tuple[Planes, Tensor]:
     t = (2 * (index + 1 + inputs["jitter"]) / (count + 1) - 1).clamp(-1, 1)
     d, reach, own = inputs["w_n"], inputs["reach"], inputs["own_n"]
     if options.two_directions:
@@ -331,7 +331,7 @@ def _tap(index: Tensor, count: Tensor, inputs: Inputs, options: _Options) -> tup
     dx, dy = d.split(1, 1)
     tap = sample(inputs, inputs["x"] - along * dx, inputs["y"] - along * dy, options.color_lookup)
     weight = _weight(along, d, tap, own, inputs, options)
-    return weight * tap.color, weight if tap.valid is None else weight * tap.valid
+    return weighted(weight, tap.color), weight if tap.valid is None else weight * tap.valid
 
 
 def _takes_center_direction(index: Tensor, inputs: Inputs, options: _Options) -> Tensor:

@@ -11,7 +11,7 @@ from torchblur.filters.base import BlurFilter, Values
 from torchblur.filters.reconstruction import Spread, Tap, Tiles, sample, spread_of, texture_of
 from torchblur.filters.revealed import RevealedBackgroundConfig, revealed_inputs
 from torchblur.frame import Frame, Shutter
-from torchblur.ops.gather import Engine, Inputs, Lookup, gather, pixel_grid
+from torchblur.ops.gather import Engine, Inputs, Lookup, Planes, gather, pixel_grid, weighted
 from torchblur.ops.noise import NoiseKind, dither_2x2, noise_plane
 from torchblur.ops.spread import Mirror, SpreadForm, TapPair, depth_shares, mirror, spread_weight
 from torchblur.ops.tiles import neighbor_min, tile_lookup, tile_min, tile_offset
@@ -278,7 +278,7 @@ def _fill(frame: Frame, color: Tensor, alpha: Tensor) -> Tensor:
     return torch.where(alone, color / torch.where(alone, alpha, 1.0), filled)
 
 
-def _pair(index: Tensor, count: Tensor, inputs: Inputs, options: _Options) -> tuple[Tensor, ...]:
+def _pair(index: Tensor, count: Tensor, inputs: Inputs, options: _Options) -> tuple[Planes, Tensor]:
     step = (index + 0.5) / count
     shift = inputs["shift"] / count
     times = TapPair(*((side * step + shift).clamp(-1, 1) for side in (1, -1)))
@@ -290,12 +290,10 @@ def _pair(index: Tensor, count: Tensor, inputs: Inputs, options: _Options) -> tu
         options.mirror,
     )
     fast = inputs["fast"] > 0
-    color, total = torch.zeros_like(taps[0].color), torch.zeros_like(taps[0].length)
-    for tap, weight in zip(taps, mirrored, strict=True):
-        used = torch.where(fast, 1.0, weight)
-        color = color + used * tap.color
-        total = total + (used if tap.valid is None else used * tap.valid)
-    return color, total
+    used = [torch.where(fast, 1.0, weight) for weight in mirrored]
+    colors = (weighted(u, tap.color) for u, tap in zip(used, taps, strict=True))
+    totals = (u if t.valid is None else u * t.valid for u, t in zip(used, taps, strict=True))
+    return tuple(a + b for a, b in zip(*colors, strict=True)), torch.add(*totals)
 
 
 def _tap(t: Tensor, count: Tensor, inputs: Inputs, options: _Options) -> tuple[Tap, Tensor]:

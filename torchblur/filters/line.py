@@ -9,7 +9,7 @@ from torch import Tensor
 
 from torchblur.filters.base import BlurFilter, FilterConfig, Values
 from torchblur.frame import LONGEST_SHUTTER, Frame, Shutter
-from torchblur.ops.gather import Engine, Inputs, Lookup, gather, lookup, pixel_grid
+from torchblur.ops.gather import Engine, Inputs, Lookup, Planes, gather, pixel_grid, read
 from torchblur.params import Param
 
 __all__ = ["LineBlur", "LineConfig", "line"]
@@ -105,7 +105,7 @@ def _blur(frame: Frame, values: Values, engine: Engine) -> Tensor:
         "half": frame.velocity * (values.shutter * 0.5),
         "x": x,
         "y": y,
-        "center": torch.full_like(x[:, :, :, :1], float(center)),
+        "center": torch.full_like(x[0, 0, 0, 0], float(center)),
     }
     if frame.valid is not None:
         valid = frame.valid.to(frame.dtype)
@@ -114,12 +114,11 @@ def _blur(frame: Frame, values: Values, engine: Engine) -> Tensor:
     return torch.where(weight > 0, color / torch.where(weight > 0, weight, 1.0), frame.color)
 
 
-def _tap(index: Tensor, count: Tensor, inputs: Inputs, options: _Options) -> tuple[Tensor, ...]:
+def _tap(index: Tensor, count: Tensor, inputs: Inputs, options: _Options) -> tuple[Planes, Tensor]:
     # Time in units of half the open interval, measured from the frame: -1 .. 1 if centered.
     time = (2 * index + 1) / count - 1 + inputs["center"]
     x = inputs["x"] - time * inputs["half"][:, :1]
     y = inputs["y"] - time * inputs["half"][:, 1:]
-    texture = lookup(inputs["texture"], x, y, options.lookup)
+    planes = read(inputs, x, y, options.lookup)
     # The fourth plane is the validity, by which the color is multiplied already.
-    weight = texture[:, 3:] if texture.shape[1] == 4 else torch.ones_like(texture[:, :1])
-    return texture[:, :3], weight
+    return planes[:3], planes[3] if len(planes) == 4 else torch.ones_like(planes[0])

@@ -19,7 +19,7 @@ from torchblur.filters.reconstruction import (
 )
 from torchblur.filters.revealed import RevealedBackgroundConfig, revealed_inputs
 from torchblur.frame import Frame, Shutter
-from torchblur.ops.gather import Engine, Inputs, Lookup, gather, pixel_grid
+from torchblur.ops.gather import Engine, Inputs, Lookup, Planes, gather, pixel_grid, weighted
 from torchblur.ops.noise import noise_plane
 from torchblur.ops.tiles import tile_lookup
 from torchblur.ops.velocity import direction, length
@@ -150,7 +150,7 @@ def _layers(frame: Frame, values: Values, engine: Engine) -> dict[str, Tensor]:
     }
 
 
-def _tap(index: Tensor, count: Tensor, inputs: Inputs, options: _Options) -> tuple[Tensor, ...]:
+def _tap(index: Tensor, count: Tensor, inputs: Inputs, options: _Options) -> tuple[Planes, Tensor]:
     t = (2 * (index + 1 + inputs["jitter"]) / (count + 1) - 1).clamp(-1, 1)
     along = (t + options.center) * inputs["reach"]
     dx, dy = inputs["direction"].split(1, 1)
@@ -187,4 +187,4 @@ def _tap(index: Tensor, count: Tensor, inputs: Inputs, options: _Options) -> tup
     )
     if options.skip_middle_tap:
         weight = weight * (2 * index != count - 1)
-    return weight * tap.color, weight if tap.valid is None else weight * tap.valid
+    return weighted(weight, tap.color), weight if tap.valid is None else weight * tap.valid

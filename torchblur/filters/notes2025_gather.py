@@ -10,7 +10,7 @@ from torch import Tensor
 from torchblur.filters.base import Values
 from torchblur.filters.reconstruction import ColorLookup, Spread, Tap, sample, texture_of
 from torchblur.frame import Frame, Shutter
-from torchblur.ops.gather import Engine, Inputs, gather, pixel_grid
+from torchblur.ops.gather import Engine, Inputs, Planes, gather, pixel_grid, weighted
 from torchblur.ops.noise import dither_2x2, noise_plane
 from torchblur.ops.spread import Mirror, SpreadForm, TapPair, depth_shares, mirror, spread_weight
 from torchblur.ops.velocity import direction, length
@@ -139,7 +139,9 @@ def gather_line(shared: Inputs, line: Line, values: Values, engine: Engine) -> S
     return Sums(*(plane * used for plane in (*sums, alpha, influence)))
 
 
-def _pair(index: Tensor, count: Tensor, inputs: Inputs, options: _Options) -> tuple[Tensor, ...]:
+def _pair(
+    index: Tensor, count: Tensor, inputs: Inputs, options: _Options
+) -> tuple[Planes, Tensor, Planes, Tensor, Tensor, Tensor]:
     step, shift = ((part / inputs["pairs"]) for part in (index + 0.5, inputs["shift"]))
     times = TapPair(*((side * step + shift).clamp(-1, 1) for side in (1, -1)))
     taps, weights = zip(*(_tap(t, inputs, options) for t in times), strict=True)
@@ -151,17 +153,18 @@ def _pair(index: Tensor, count: Tensor, inputs: Inputs, options: _Options) -> tu
     )
     taken = (index < inputs["pairs"]).to(step.dtype)
     parts = [_parts(tap, taken * w) for tap, w in zip(taps, mirrored, strict=True)]
-    sums = (ahead + behind for ahead, behind in zip(parts[0][:5], parts[1][:5], strict=True))
-    return *sums, torch.maximum(parts[0][5], parts[1][5])
+    *sums, _ = (ahead + behind for ahead, behind in zip(*parts, strict=True))
+    influence = torch.maximum(parts[0][-1], parts[1][-1])
+    return tuple(sums[:3]), sums[3], tuple(sums[4:7]), sums[7], sums[8], influence
 
 
-def _parts(tap: Tap, weights: Tensor) -> tuple[Tensor, ...]:
+def _parts(tap: Tap, weights: Tensor) -> Planes:
     background, foreground, alpha = weights.split(1, 1)
     influence = torch.where(background + foreground > 0, tap.length, 0.0)
-    colors = background * tap.color, foreground * tap.color
+    colors = weighted(background, tap.color), weighted(foreground, tap.color)
     if tap.valid is not None:
         background, foreground = background * tap.valid, foreground * tap.valid
-    return colors[0], background, colors[1], foreground, alpha, influence
+    return *colors[0], background, *colors[1], foreground, alpha, influence
 
 
 def _tap(t: Tensor, inputs: Inputs, options: _Options) -> tuple[Tap, Tensor]:

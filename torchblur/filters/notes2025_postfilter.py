@@ -10,7 +10,7 @@ from torch import Tensor
 from torchblur.filters.base import Values
 from torchblur.filters.notes2025_gather import Blurred, Line
 from torchblur.frame import Frame
-from torchblur.ops.gather import Engine, Inputs, gather, lookup, pixel_grid
+from torchblur.ops.gather import Engine, Inputs, Planes, gather, pixel_grid, read, weighted
 from torchblur.ops.velocity import direction, length
 from torchblur.ops.weights import saturate
 
@@ -114,20 +114,19 @@ def _is_edge(peak: Tensor, inputs: Inputs, options: _Options) -> Tensor:
 
 def _post_tap(
     index: Tensor, count: Tensor, inputs: Inputs, options: _Options
-) -> tuple[Tensor, ...]:
+) -> tuple[Planes, Tensor, Planes, Tensor, Tensor]:
     """Return color and weight of a sample, twice, and its alpha; even ones lie ahead."""
     place = torch.floor(index / 2)
     side = 1 - 2 * torch.remainder(index, 2)
     step = side * inputs["radius"] * (place + 0.5) / inputs["per_side"]
     dx, dy = (inputs["unit"] * step).split(1, 1)
-    planes = lookup(inputs["texture"], inputs["x"] + dx, inputs["y"] + dy)
-    color, alpha, output, usable = planes.split((3, 1, 1, 1), 1)
+    red, green, blue, alpha, output, usable = read(inputs, inputs["x"] + dx, inputs["y"] + dy)
     accepted, alive = _accept(alpha, inputs, options)
     taken = inputs["used"] * (place < inputs["per_side"])
     outer = taken * usable * accepted
     inner = outer * alive
-    rgba = torch.cat((color, output), 1)
-    return inner * rgba, inner, outer * rgba, outer, alpha * taken
+    rgba = red, green, blue, output
+    return weighted(inner, rgba), inner, weighted(outer, rgba), outer, alpha * taken
 
 
 def _accept(alpha: Tensor, inputs: Inputs, options: _Options) -> tuple[Tensor, Tensor]:

@@ -10,7 +10,7 @@ from torch import Tensor
 from torchblur.filters.base import FilterConfig, Values
 from torchblur.filters.revealed import background_share
 from torchblur.frame import Frame, Shutter
-from torchblur.ops.gather import Inputs, Lookup, lookup
+from torchblur.ops.gather import Inputs, Lookup, Planes, read
 from torchblur.ops.noise import NoiseKind
 from torchblur.ops.tiles import neighbor_max, tile_max
 from torchblur.ops.velocity import clamp_length, direction, half_velocity, length, quantize_uint8
@@ -253,16 +253,16 @@ def spread_of(
 
 
 def texture_of(frame: Frame, spread: Spread) -> Tensor:
-    """Return what a tap looks up, in one texture: color, û, |V|, depth, and validity if given.
+    """Return what a tap looks up, in one texture: û, |V|, depth, color, and validity if given.
 
     Returns:
         Planes, (B, 7 or 8, H, W).
     """
-    planes = [frame.color, spread.unit, spread.length, frame.finite_depth()]
-    if frame.valid is not None:
-        valid = frame.valid.to(frame.dtype)
-        planes = [frame.color * valid, *planes[1:], valid]
-    return torch.cat(planes, 1)
+    planes = [spread.unit, spread.length, frame.finite_depth()]
+    if frame.valid is None:
+        return torch.cat((*planes, frame.color), 1)
+    valid = frame.valid.to(frame.dtype)
+    return torch.cat((*planes, frame.color * valid, valid), 1)
 
 
 WEIGHT_PARAMETERS = (
@@ -287,7 +287,7 @@ def is_one(value: Tensor) -> bool:
 class Tap(NamedTuple):
     """What one tap sees; the color is multiplied by the validity, where there is one."""
 
-    color: Tensor
+    color: Planes
     unit_x: Tensor
     unit_y: Tensor
     length: Tensor
@@ -299,8 +299,8 @@ def sample(inputs: Inputs, x: Tensor, y: Tensor, color_lookup: ColorLookup) -> T
     """Look up a tap.
 
     Args:
-        inputs: "texture" from `texture_of`; "linear" (0 or 1, (B, 1, H, W)) for an opportunistic
-            lookup; the planes of `revealed_inputs`, if any, and "depth".
+        inputs: "texture" from `texture_of`; "linear" (0 or 1) for an opportunistic lookup; the
+            planes of `revealed_inputs`, if any, and "depth".
         x: Column, px.
         y: Row, px.
         color_lookup: Lookup of the color (and of its validity): nearest, bilinear, or bilinear
@@ -309,24 +309,21 @@ def sample(inputs: Inputs, x: Tensor, y: Tensor, color_lookup: ColorLookup) -> T
     Returns:
         The tap; what shows the revealed layer has its color.
     """
-    texture = inputs["texture"]
-    planes = lookup(texture, x, y)
-    color, ux, uy, size, depth, *valid = planes.split((3, *[1] * (planes.shape[1] - 3)), 1)
+    ux, uy, size, depth, *near = read(inputs, x, y)
     if color_lookup != "nearest":
-        near = [color, *valid]
-        fine = [lookup(texture[:, :3], x, y, "bilinear")]
-        fine += [lookup(texture[:, 7:], x, y, "bilinear") for _ in valid]
+        fine = read(inputs, x, y, "bilinear", slice(4, None))
         if color_lookup == "opportunistic":
             linear = inputs["linear"] > 0
-            fine = [torch.where(linear, f, n) for f, n in zip(fine, near, strict=True)]
-        color, *valid = fine
-    tap = Tap(color, ux, uy, size, depth, valid[0] if valid else None)
+            fine = tuple(torch.where(linear, f, n) for f, n in zip(fine, near, strict=True))
+        near = list(fine)
+    tap = Tap(tuple(near[:3]), ux, uy, size, depth, near[3] if near[3:] else None)
     if "revealed" not in inputs:
         return tap
     share = background_share(inputs, x, y, depth)
-    color = color + share * (inputs["revealed"] - color)
+    behind = inputs["revealed"].split(1, 1)
     return tap._replace(
-        color=color, valid=None if tap.valid is None else tap.valid + share * (1 - tap.valid)
+        color=tuple(c + share * (b - c) for c, b in zip(tap.color, behind, strict=True)),
+        valid=None if tap.valid is None else tap.valid + share * (1 - tap.valid),
     )
 
 

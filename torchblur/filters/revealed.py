@@ -17,7 +17,7 @@ from torch import Tensor
 
 from torchblur.filters.base import FilterConfig, Values
 from torchblur.frame import Frame
-from torchblur.ops.gather import Inputs, lookup
+from torchblur.ops.gather import Inputs, read
 from torchblur.params import Param
 
 __all__ = [
@@ -111,7 +111,7 @@ def revealed_inputs(
 
     Returns:
         "revealed" (B, 3, H, W), the layer's blurred color; "open" (B, 1, H, W), 1 where the frame
-        shows the layer itself; "behind", the slope of `behind_slope`.
+        shows the layer itself, also as "texture_open"; "behind", the slope of `behind_slope`.
 
     Differentiable: in color, in the depth of both, and in `background_depth`.
     Raises: FrameError if there is no revealed layer, or it has no depth.
@@ -119,9 +119,11 @@ def revealed_inputs(
     if values.background == "guessed":
         return {}
     layer, valid = layer_behind(frame)
+    shown = torch.where(_gap(frame, layer) > _LEAST_STEP, 0.0, valid)
     return {
         "revealed": blur(layer, Values(**(vars(values) | {"background": "guessed"}))),
-        "open": torch.where(_gap(frame, layer) > _LEAST_STEP, 0.0, valid),
+        "open": shown,
+        "texture_open": shown,
         "behind": behind_slope(frame, values.background_depth),
     }
 
@@ -139,4 +141,4 @@ def background_share(inputs: Inputs, x: Tensor, y: Tensor, depth: Tensor) -> Ten
         depth: Z_S, the tap's depth, scene units.
     """
     behind = share_behind(inputs["behind"], inputs["depth"], depth)
-    return behind + inputs["open"] * lookup(inputs["open"], x, y)
+    return behind + inputs["open"] * read(inputs, x, y, name="texture_open")[0]

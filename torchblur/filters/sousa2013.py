@@ -21,7 +21,7 @@ from torchblur.filters.reconstruction import (
     texture_of,
 )
 from torchblur.frame import Frame, Shutter
-from torchblur.ops.gather import Engine, Inputs, Lookup, gather, pixel_grid
+from torchblur.ops.gather import Engine, Inputs, Lookup, Planes, gather, pixel_grid, weighted
 from torchblur.ops.noise import NoiseKind, noise_plane
 from torchblur.ops.tiles import neighbor_max, tile_lookup, tile_max
 from torchblur.ops.velocity import (
@@ -217,7 +217,7 @@ def _pass(
     return resolve(frame, sums, center_weight, reach > values.early_out)
 
 
-def _tap(index: Tensor, count: Tensor, inputs: Inputs, options: _Options) -> tuple[Tensor, ...]:
+def _tap(index: Tensor, count: Tensor, inputs: Inputs, options: _Options) -> tuple[Planes, Tensor]:
     t = (2 * (index + 1 + inputs["jitter"]) / (count + 1) - 1).clamp(-1, 1)
     along = (t + options.center) * inputs["reach"]
     d = inputs["direction"]
@@ -250,7 +250,7 @@ def _tap(index: Tensor, count: Tensor, inputs: Inputs, options: _Options) -> tup
         + inputs["background_gain"] * second
         + inputs["third_gain"] * third
     )
-    return weight * tap.color, weight if tap.valid is None else weight * tap.valid
+    return weighted(weight, tap.color), weight if tap.valid is None else weight * tap.valid
 
 
 def _cylinder(distance: Tensor, size: Tensor, inputs: Inputs, softness: float) -> Tensor:

@@ -23,7 +23,7 @@ from torchblur.filters.reconstruction import (
 from torchblur.filters.revealed import behind_slope, layer_behind, share_behind
 from torchblur.filters.tan2022_config import Tan2022Config
 from torchblur.frame import Frame, Shutter
-from torchblur.ops.gather import Engine, Inputs, Lookup, gather, pixel_grid
+from torchblur.ops.gather import Engine, Inputs, Lookup, Planes, gather, pixel_grid, weighted
 from torchblur.ops.noise import noise_plane
 from torchblur.ops.raymask import RayMask, edge_strength, ray_mask, uncovered
 from torchblur.ops.tiles import tile_lookup
@@ -235,7 +235,9 @@ def _composite(
     return torch.where(hybrid == 1, mixed, plain + hybrid * (mixed - plain))
 
 
-def _tap(index: Tensor, count: Tensor, inputs: Inputs, options: _Options) -> tuple[Tensor, ...]:
+def _tap(
+    index: Tensor, count: Tensor, inputs: Inputs, options: _Options
+) -> tuple[Planes, Tensor, Planes, Tensor]:
     t = ((index + 0.5 + inputs["jitter"]) / count).clamp(0, 1)
     if options.side == 0:
         t = 2 * t - 1
@@ -244,7 +246,8 @@ def _tap(index: Tensor, count: Tensor, inputs: Inputs, options: _Options) -> tup
     tap = sample(inputs, inputs["x"] - along * dx, inputs["y"] - along * dy, options.color_lookup)
     front, back = _weights(along.abs(), tap, inputs, options)
     valid = 1.0 if tap.valid is None else tap.valid
-    return front * tap.color, front * valid, back * tap.color, back * valid
+    colors = weighted(front, tap.color), weighted(back, tap.color)
+    return colors[0], front * valid, colors[1], back * valid
 
 
 def _weights(

@@ -1,7 +1,7 @@
 """Sums over a 5x5 kernel, weighted by the paths of the samples: split, accumulate, à-trous.
 
 All work on lists of pixels (`ops.points`) and look up in whole planes. Memory does not grow with
-the taps, as they go through `ops.gather`.
+the taps, as they go through `ops.taps`.
 """
 
 from __future__ import annotations
@@ -11,9 +11,10 @@ from typing import Literal, NamedTuple
 import torch
 from torch import Tensor
 
-from torchblur.ops.gather import Engine, Inputs, Lookup, gather
+from torchblur.ops.gather import Lookup
 from torchblur.ops.points import Points, flat, nearest_index
 from torchblur.ops.segments import path_weight
+from torchblur.ops.taps import Engine, Inputs, sum_taps
 
 __all__ = [
     "Centers",
@@ -128,7 +129,7 @@ def split_sums(
         taps: From `kernel_taps`.
         widths: Reach of the weights.
         centers: The pixels' own data.
-        engine: See `ops.gather`.
+        engine: See `ops.taps`.
 
     Differentiable: in all floating planes and in the widths.
     Border: replicated; a replicated sample is where it is, not where the tap is.
@@ -138,7 +139,7 @@ def split_sums(
     colors = samples.values.shape[1] - 3
     inputs = {"texture": flat(torch.cat(samples, 1)), "taps": taps}
     inputs |= points.inputs() | widths._asdict() | centers._asdict()
-    return Sums(*gather(_split_tap, _Split(colors), taps.shape[0], inputs, engine))
+    return Sums(*sum_taps(_split_tap, _Split(colors), taps.shape[0], inputs, engine))
 
 
 def _split_tap(index: Tensor, count: Tensor, inputs: Inputs, options: _Split) -> tuple[Tensor, ...]:
@@ -232,7 +233,7 @@ def path_sums(
         shape: How the kernel is turned and stretched; None: not at all.
         lookup: "nearest" rounds the taps' displacements to whole pixels. "bilinear" interpolates
             values times W, and W.
-        engine: See `ops.gather`.
+        engine: See `ops.taps`.
 
     Returns:
         Sums of the values (K, N) and of the weights (1, N).
@@ -247,7 +248,7 @@ def path_sums(
         texture = torch.cat((texture[:, :-1] * texture[:, -1:], texture[:, -1:]), 1)
     inputs = {"texture": flat(texture), "taps": taps}
     inputs |= points.inputs() | widths._asdict() | shape._asdict()
-    values, weight = gather(_path_tap, _Path(lookup), taps.shape[0], inputs, engine)
+    values, weight = sum_taps(_path_tap, _Path(lookup), taps.shape[0], inputs, engine)
     return values, weight
 
 
@@ -309,7 +310,7 @@ def plain_sums(
         keep: 1 where only the pixel itself counts, with ``W``, else 0, (1, N).
         shape: How the kernel is turned and stretched; None: not at all.
         lookup: As in `path_sums`.
-        engine: See `ops.gather`.
+        engine: See `ops.taps`.
 
     Returns:
         Sums of the values (K, N) and of the weights (1, N).
@@ -324,7 +325,7 @@ def plain_sums(
     texture = torch.cat((texture[:, :-1] * texture[:, -1:], texture[:, -1:]), 1)
     inputs = {"texture": flat(texture), "taps": taps, "keep": keep}
     inputs |= points.inputs() | shape._asdict()
-    values, weight = gather(_plain_tap, _Path(lookup), taps.shape[0], inputs, engine)
+    values, weight = sum_taps(_plain_tap, _Path(lookup), taps.shape[0], inputs, engine)
     return values, weight
 
 

@@ -1,34 +1,40 @@
-"""The gather: a sum over taps, one engine for all filters.
+"""The gather of the filters: a sum over taps around every pixel of a batch of images.
 
 A filter is a *tap function*, which returns what one tap adds to each accumulator, and a
-*resolve*, which turns the accumulators into an image. As the accumulators are sums, the incoming
-gradient is the same for every tap: the backward pass runs over the taps again and stores nothing
-per tap, so memory does not grow with their number. The same tap function runs eagerly or
-compiled; its index and their number are tensors, so that neither compiles anew.
+*resolve*, which turns the accumulators into an image. Inside a tap all planes are lists of
+pixels, (P, C, 1, M), as `ops.pixels` says, so that one compiled kernel serves any size, batch and
+share of active pixels. What a tap reads comes plane by plane, so that the compiler makes one loop
+of the whole tap.
 """
 
 from __future__ import annotations
 
-import functools
-from collections.abc import Callable, Hashable, Mapping
-from typing import Any, Literal
+from collections.abc import Hashable, Mapping
+from typing import Literal
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from torchblur.errors import ConfigError
-from torchblur.ops.compiling import compiler_errors, load_compiler, warn_no_compiler
+from torchblur.ops.pixels import PixelList
+from torchblur.ops.taps import Engine, Inputs, Planes, TapFunction, sum_taps
 
-__all__ = ["Engine", "Inputs", "Lookup", "TapFunction", "gather", "lookup", "pixel_grid"]
+__all__ = [
+    "Engine",
+    "Inputs",
+    "Lookup",
+    "Planes",
+    "TapFunction",
+    "gather",
+    "lookup",
+    "pixel_grid",
+    "read",
+    "weighted",
+]
 
-Engine = Literal["eager", "compiled"]
 Lookup = Literal["nearest", "bilinear"]
-Inputs = dict[str, Tensor]
-TapFunction = Callable[[Tensor, Tensor, Inputs, Any], tuple[Tensor, ...]]
-"""``tap(index, count, inputs, options)``: index and count are 0-d float tensors."""
 
-_Step = Callable[[tuple[Tensor, ...], Tensor, Tensor, Inputs], tuple[Tensor, ...]]
+_MOST_ROWS = 4096  # of all images of a batch; with more, normalized float32 rows lose accuracy
 
 
 def gather(
@@ -39,21 +45,28 @@ def gather(
     engine: Engine = "eager",
     *,
     num_maxima: int = 0,
+    active: Tensor | None = None,
 ) -> tuple[Tensor, ...]:
     """Return the sums over ``num_samples`` taps of what the tap function returns.
 
     Args:
-        tap: A module-level function of plain torch operations. It may use nothing but its
-            arguments: whatever needs a gradient must be in `inputs`.
+        tap: A module-level function of plain torch operations on planes (P, C, 1, M). It may use
+            nothing but its arguments: whatever needs a gradient must be in `inputs`. It looks up
+            with `read`. A tuple of planes among what it returns is one accumulator with so many
+            channels.
         options: Switches for the tap function, hashable; each set is compiled once.
         num_samples: Number of taps, N >= 1.
-        inputs: Tensors by name: planes (B, C, H, W) and parameters that broadcast to them.
+        inputs: Tensors by name: "texture" (B, C, H, W), what is looked up, and others whose names
+            begin so; planes (B, C, H, W) and parameters that broadcast to them. If the texture
+            has a batch of one, planes and parameters with a batch of P are P parameter sets,
+            which share all that they can.
         engine: "eager", or "compiled" to compile the tap function with `torch.compile`; without
             a compiler there is one warning and the eager result.
         num_maxima: So many accumulators, the last ones, are maxima over the taps, not sums.
+        active: Pixels that are wanted, bool, (B or P, 1, H, W); the others are 0 and cost nothing.
 
     Returns:
-        The accumulators, in the tap's order.
+        The accumulators (B or P, C, H, W), in the tap's order.
 
     Differentiable: once, in all floating `inputs`, with memory independent of N. Backward costs
         about one forward and backward of each tap. The gradient of a maximum goes to the first
@@ -62,122 +75,87 @@ def gather(
     Raises:
         ConfigError: if the engine has another name.
     """
-    if engine not in ("eager", "compiled"):
-        raise ConfigError(f"`engine` must be 'eager' or 'compiled', got {engine!r}")
-    names = tuple(inputs)
-    tensors = tuple(inputs.values())
-    wanted = torch.is_grad_enabled() and any(t.requires_grad for t in tensors)
-    for candidate in ("compiled", "eager") if engine == "compiled" else ("eager",):
-        step = _step(tap, options, candidate, num_maxima)
-        try:
-            if wanted:
-                return _apply(step, num_samples, num_maxima, names, *tensors)
-            with torch.no_grad():
-                return _sum_taps(step, num_samples, dict(inputs))
-        except compiler_errors() as error:
-            if candidate == "eager":
-                raise
-            warn_no_compiler((str(error).splitlines() or [type(error).__name__])[0])
-    raise AssertionError("unreachable")
+    pixels = PixelList.where(inputs["texture"], active)
+    lists = pixels.lists(inputs)
+    totals = sum_taps(tap, options, num_samples, lists, engine, num_maxima=num_maxima)
+    return tuple(pixels.unpack(total) for total in totals)
 
 
-class _Gather(torch.autograd.Function):
-    """Sum over taps whose backward recomputes each tap."""
+def read(
+    inputs: Inputs,
+    x: Tensor,
+    y: Tensor,
+    mode: Lookup = "nearest",
+    channels: slice = slice(None),
+    name: str = "texture",
+) -> Planes:
+    """Return a tap's view of the texture at positions in pixel indices; for tap functions.
 
-    @staticmethod
-    def forward(
-        ctx: Any,
-        step: _Step,
-        num_samples: int,
-        num_maxima: int,
-        names: tuple[str, ...],
-        *tensors: Tensor,
-    ) -> tuple[Tensor, ...]:
-        ctx.step, ctx.num_samples, ctx.names = step, num_samples, names
-        totals = _sum_taps(step, num_samples, dict(zip(names, tensors, strict=True)))
-        ctx.num_maxima = num_maxima
-        ctx.save_for_backward(*tensors, *totals[len(totals) - num_maxima :])
-        return totals
+    Args:
+        inputs: The tap's inputs.
+        x: Columns, px; 0 is the center of the first pixel, (P, 1, 1, M).
+        y: Rows, px, likewise.
+        mode: "nearest" (ties to even) or "bilinear".
+        channels: Those of the texture that are wanted.
+        name: Which texture.
 
-    @staticmethod
-    @torch.autograd.function.once_differentiable
-    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
-        needed = ctx.needs_input_grad[4:]
-        saved, peaks = ctx.saved_tensors[: len(needed)], ctx.saved_tensors[len(needed) :]
-        leaves = [t.detach().requires_grad_(n) for t, n in zip(saved, needed, strict=True)]
-        taken = [torch.zeros_like(peak, dtype=torch.bool) for peak in peaks]
-        wanted = [leaf for leaf, n in zip(leaves, needed, strict=True) if n]
-        totals = [torch.zeros_like(leaf) for leaf in wanted]
-        inputs = dict(zip(ctx.names, leaves, strict=True))
-        count = _scalar(ctx.num_samples, leaves[0])
-        for index in range(ctx.num_samples):
-            with torch.enable_grad():
-                added = ctx.step((), _scalar(index, leaves[0]), count, inputs)
-            split = len(added) - ctx.num_maxima
-            due = *grads[:split], *_due(added[split:], peaks, taken, grads[split:])
-            pairs = [(a, g) for a, g in zip(added, due, strict=True) if a.requires_grad]
-            parts = torch.autograd.grad(
-                [a for a, _ in pairs], wanted, [g.expand_as(a) for a, g in pairs], allow_unused=True
-            )
-            for total, part in zip(totals, parts, strict=True):
-                if part is not None:
-                    total += part
-        result = iter(totals)
-        return (None, None, None, None, *(next(result) if n else None for n in needed))
+    Returns:
+        One plane (P, 1, 1, M) per channel.
+
+    Border: replicated.
+    Differentiable: in the texture; in the positions with "bilinear" only.
+    """
+    texture = inputs[name][channels]
+    x = x.clamp(0, texture.shape[2] - 1)
+    y = torch.minimum(y.clamp(min=0), inputs["height"] - 1)
+    if mode == "nearest":
+        return _split(_at(texture, x.round(), y.round() + inputs["first_row"]))
+    if not torch.compiler.is_compiling() and texture.shape[1] <= _MOST_ROWS:
+        return _sampled(texture, x, y + inputs["first_row"])
+    left, top = x.detach().floor(), y.detach().floor()
+    right = (left + 1).clamp(max=texture.shape[2] - 1)
+    bottom = torch.minimum(top + 1, inputs["height"] - 1)
+    dx, dy = x - left, y - top
+    rows = []
+    for row in (top + inputs["first_row"], bottom + inputs["first_row"]):
+        pairs = zip(_at(texture, left, row), _at(texture, right, row), strict=True)
+        rows.append([torch.lerp(a, b, dx) for a, b in pairs])
+    return _split(tuple(torch.lerp(a, b, dy) for a, b in zip(*rows, strict=True)))
 
 
-def _due(
-    added: tuple[Tensor, ...],
-    peaks: tuple[Tensor, ...],
-    taken: list[Tensor],
-    grads: tuple[Tensor, ...],
-) -> list[Tensor]:
-    """Return the gradients of the maxima where this tap is the first to reach them."""
-    due = []
-    for value, peak, before, grad in zip(added, peaks, taken, grads, strict=True):
-        # Recomputed by another graph, a value may differ in its last bits.
-        first = (value.detach() >= peak - 1e-6 * peak.abs()) & ~before
-        before |= first
-        due.append(grad * first)
-    return due
+def weighted(weight: Tensor, planes: Planes) -> Planes:
+    """Return each plane times the weight."""
+    return tuple(weight * plane for plane in planes)
 
 
-_apply: Callable[..., tuple[Tensor, ...]] = _Gather.apply
+def _sampled(texture: Tensor, x: Tensor, y: Tensor) -> Planes:
+    """Return bilinear values by torch's own function, which is fast where nothing is compiled."""
+    height, width = texture.shape[1:]
+    grid = torch.stack(((2 * x + 1) / width - 1, (2 * y + 1) / height - 1), dim=-1)
+    grid = grid.reshape(1, x.shape[0], -1, 2)
+    values = F.grid_sample(texture[None], grid, padding_mode="border", align_corners=False)
+    return values.reshape(texture.shape[0], *x.shape).unbind(0)
 
 
-def _sum_taps(step: _Step, num_samples: int, inputs: Inputs) -> tuple[Tensor, ...]:
-    like = next(iter(inputs.values()))
-    count = _scalar(num_samples, like)
-    inputs = {name: tensor.detach() for name, tensor in inputs.items()}
-    sums: tuple[Tensor, ...] = ()
-    for index in range(num_samples):
-        sums = step(sums, _scalar(index, like), count, inputs)
-    return sums
+def _at(texture: Tensor, column: Tensor, row: Tensor) -> Planes:
+    """Return values at whole pixels: one by one to the compiler, which joins them in one loop.
+
+    Returns:
+        One plane (P, 1, 1, M) per channel, or without a compiler all in one (C, P, 1, 1, M).
+    """
+    index = row.to(torch.int32) * texture.shape[2] + column.to(torch.int32)
+    flat = texture.flatten(1)
+    if not torch.compiler.is_compiling():
+        return (flat.index_select(1, index.flatten()).reshape(texture.shape[0], *index.shape),)
+    sets = index.shape[0]
+    where = index.reshape(sets, -1).long()
+    planes = [flat[c].expand(sets, -1).gather(1, where) for c in range(texture.shape[0])]
+    return tuple(plane.reshape(index.shape) for plane in planes)
 
 
-def _scalar(value: int, like: Tensor) -> Tensor:
-    return torch.tensor(float(value), dtype=like.dtype, device=like.device)
-
-
-@functools.lru_cache(maxsize=64)
-def _step(tap: TapFunction, options: Hashable, engine: Engine, num_maxima: int = 0) -> _Step:
-    """Return the function that adds one tap to the sums; one object for each structure."""
-
-    def step(
-        sums: tuple[Tensor, ...], index: Tensor, count: Tensor, inputs: Inputs
-    ) -> tuple[Tensor, ...]:
-        added = tap(index, count, inputs, options)
-        if not sums:
-            return added
-        split = len(added) - num_maxima
-        total = (s + a for s, a in zip(sums[:split], added[:split], strict=True))
-        largest = (torch.maximum(s, a) for s, a in zip(sums[split:], added[split:], strict=True))
-        return *total, *largest
-
-    if engine == "compiled":
-        load_compiler()
-        return torch.compile(step, dynamic=True)
-    return step
+def _split(planes: Planes) -> Planes:
+    """Return planes (P, 1, 1, M)."""
+    return planes if planes[0].ndim == 4 else planes[0].unbind(0)
 
 
 # -- lookups ---------------------------------------------------------------------------------------

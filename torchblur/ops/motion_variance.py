@@ -12,7 +12,6 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from torchblur.ops.gather import Engine, Inputs, gather
 from torchblur.ops.points import (
     Points,
     flat,
@@ -23,6 +22,7 @@ from torchblur.ops.points import (
     take,
     total,
 )
+from torchblur.ops.taps import Engine, Inputs, sum_taps
 
 __all__ = ["AngleMode", "MotionEstimate", "Motions", "estimate_motion"]
 
@@ -88,7 +88,7 @@ def estimate_motion(
         stride: The estimate is made at the top left pixel of each block of so many px squared,
             and holds for the block.
         mode: What angles are measured against.
-        engine: See `ops.gather`.
+        engine: See `ops.taps`.
 
     Returns:
         Planes (B, 1, H, W). Windows without motion cost one look at the mask.
@@ -166,7 +166,7 @@ def _over_samples(
 ) -> tuple[Tensor, ...]:
     options = _Options(window)
     parts = [
-        gather(tap, options, window * window, inputs | {"texture": texture}, engine)
+        sum_taps(tap, options, window * window, inputs | {"texture": texture}, engine)
         for texture in textures
     ]
     return total(parts)

@@ -1,7 +1,7 @@
 """Lists of pixels: what is computed for a list costs nothing where the list does not reach.
 
 Planes (B, C, H, W) are laid flat as (C, B·H·W); a list holds positions in them. Values of a list
-are (C, N), one column per pixel. The taps of a gather (`ops.gather`) look up at positions near
+are (C, N), one column per pixel. The taps of a gather (`ops.taps`) look up at positions near
 the listed pixels, and may leave the list but not the image.
 """
 
@@ -13,7 +13,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from torchblur.ops.gather import Inputs
+from torchblur.ops.taps import Inputs
 
 __all__ = [
     "Points",

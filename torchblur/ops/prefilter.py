@@ -7,9 +7,9 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from torchblur.ops.gather import Engine, Inputs, gather
 from torchblur.ops.points import Points, flat, nearest_index, per_point, points_where, put, take
 from torchblur.ops.segments import path_distance
+from torchblur.ops.taps import Engine, Inputs, sum_taps
 
 __all__ = ["Candidates", "Stream", "add_candidates", "random_candidates"]
 
@@ -80,7 +80,7 @@ def add_candidates(
         jitter: Largest |j| in x and in y, px; a number or (B, 1, H, W).
         distance: Threshold of the distance to the path, px, likewise.
         min_length: Least displacement over the shutter, px, likewise.
-        engine: See `ops.gather`.
+        engine: See `ops.taps`.
 
     Returns:
         (B, C, H, W); other pixels are as they were.
@@ -101,7 +101,7 @@ def add_candidates(
     inputs = {"texture": flat(torch.cat((stream.color, stream.displacement, stream.time), 1))}
     inputs |= points.inputs() | {"drawn": drawn, "moving": flat(stream.moving)}
     inputs["distance"] = per_point(distance, points, stream.color)
-    color, count = gather(_tap, _Options(number), 9 * number, inputs, engine)
+    color, count = sum_taps(_tap, _Options(number), 9 * number, inputs, engine)
     mean = (take(stream.color, points) + color) / (1 + count)
     return put(mean, points, stream.color)
 

@@ -13,7 +13,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from torchblur.ops.gather import Engine, Inputs, gather, lookup, pixel_grid
+from torchblur.ops.gather import Engine, Inputs, gather, lookup, pixel_grid, read
 from torchblur.ops.velocity import direction
 from torchblur.ops.weights import threshold
 
@@ -100,7 +100,7 @@ def uncovered(
     """
     x, y = _moved(displacement, 1.0)
     deeper = (lookup(depth, x, y) - depth) / soft_depth_extent
-    result = threshold(deeper - 1, softness) * _inside(depth, x, y)
+    result = threshold(deeper - 1, softness) * _inside(x, y, *depth.shape[-2:])
     result = result * (direction(displacement) != 0).any(1, keepdim=True)
     if object_id is not None:
         result = result * (lookup(object_id, x, y) != object_id)
@@ -126,7 +126,7 @@ def reaches(
     Reference: Tan 2022, section 3.2.1 (range check).
     """
     x, y = pixel_grid(mask)
-    inputs = {"mask": mask, "displacement": displacement, "x": x, "y": y}
+    inputs = {"texture": mask, "displacement": displacement, "x": x, "y": y}
     (found,) = gather(_reach_tap, None, num_samples, inputs, engine, num_maxima=1)
     return found * (direction(displacement) != 0).any(1, keepdim=True)
 
@@ -160,8 +160,9 @@ def ray_mask(
 
 def _reach_tap(index: Tensor, count: Tensor, inputs: Inputs, options: None) -> tuple[Tensor, ...]:
     dx, dy = (inputs["displacement"] * (index / count)).split(1, 1)
-    x, y, mask = inputs["x"] + dx, inputs["y"] + dy, inputs["mask"]
-    return (lookup(mask, x, y) * _inside(mask, x, y),)
+    x, y = inputs["x"] + dx, inputs["y"] + dy
+    inside = _inside(x, y, inputs["height"], inputs["texture"].shape[2])
+    return (read(inputs, x, y)[0] * inside,)
 
 
 def _moved(displacement: Tensor, share: float) -> tuple[Tensor, Tensor]:
@@ -170,7 +171,7 @@ def _moved(displacement: Tensor, share: float) -> tuple[Tensor, Tensor]:
     return x + dx, y + dy
 
 
-def _inside(like: Tensor, x: Tensor, y: Tensor) -> Tensor:
-    height, width = like.shape[-2:]
-    x, y = x.round(), y.round()
-    return ((x >= 0) & (x <= width - 1) & (y >= 0) & (y <= height - 1)).to(like.dtype)
+def _inside(x: Tensor, y: Tensor, height: Tensor | int, width: int) -> Tensor:
+    column, row = x.round(), y.round()
+    inside = (column >= 0) & (column <= width - 1) & (row >= 0) & (row <= height - 1)
+    return inside.to(x.dtype)

@@ -10,7 +10,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from torchblur.frame import FAR_DEPTH
-from torchblur.ops.gather import Engine, Inputs, gather, lookup, pixel_grid
+from torchblur.ops.gather import Engine, Inputs, Planes, gather, pixel_grid, read, weighted
 from torchblur.ops.noise import NoiseKind, noise_plane
 from torchblur.params import Config, Param
 from torchblur.post.base import Effect, Values, check_plane
@@ -261,21 +261,23 @@ def _gather(
     return gather(_tap, _Options(behind is not None, window), num_samples, inputs, engine)
 
 
-def _tap(index: Tensor, count: Tensor, inputs: Inputs, options: _Options) -> tuple[Tensor, ...]:
+def _tap(
+    index: Tensor, count: Tensor, inputs: Inputs, options: _Options
+) -> tuple[Planes | Tensor, ...]:
     dx, dy, distance, share = _position(index, count, inputs, options)
-    texture = lookup(inputs["texture"], inputs["x"] + dx, inputs["y"] + dy)
-    color, circle = texture[:, :3], texture[:, 3:4]
+    planes = read(inputs, inputs["x"] + dx, inputs["y"] + dy)
+    color, circle = planes[:3], planes[3]
     edge = inputs["edge"]
     area = (math.pi * (circle * circle + edge * edge / 12)).clamp_min(1)
     seen = circle if options.near else torch.minimum(circle, inputs["circle"])
     weight = share * ((seen - distance) / edge + 0.5).clamp(0, 1) / area
     if not options.near:
-        return weight * color, weight
+        return weighted(weight, color), weight
     weight = torch.where(circle > _SHARP_PX, weight, 0.0)
     # What is half as blurred, or less, lies behind a near pixel.
     farther = 2 * (1 - circle / inputs["circle"].clamp_min(_SHARP_PX))
     shown = share * farther.clamp(0, 1) / (1 + distance * distance)
-    return weight * color, weight, shown * texture[:, 4:], shown
+    return weighted(weight, color), weight, weighted(shown, planes[4:]), shown
 
 
 def _position(

@@ -1,0 +1,135 @@
+import subprocess
+import sys
+
+import pytest
+import torch
+
+from torchblur.errors import ConfigError
+from torchblur.ops.gather import lookup, pixel_grid
+from torchblur.ops.taps import sum_taps
+
+
+def tap(index, count, inputs, options):
+    x, y = pixel_grid(inputs["image"])
+    color = lookup(inputs["image"], x + index * inputs["step"], y, options)
+    weight = torch.exp(-inputs["decay"] * index / count)
+    return weight * color, weight.expand_as(color[:, :1])
+
+
+def unrolled(inputs, num_samples, options):
+    parts = [
+        tap(
+            torch.tensor(float(i), dtype=inputs["image"].dtype),
+            torch.tensor(float(num_samples)),
+            inputs,
+            options,
+        )
+        for i in range(num_samples)
+    ]
+    return tuple(sum(p) for p in zip(*parts, strict=True))
+
+
+def make_inputs(dtype=torch.float64):
+    return {
+        "image": torch.rand(2, 3, 5, 9, dtype=dtype),
+        "step": torch.tensor(0.37, dtype=dtype),
+        "decay": torch.rand(2, 1, 1, 1, dtype=dtype) + 0.5,
+    }
+
+
+@pytest.mark.parametrize("mode", ["nearest", "bilinear"])
+def test_sum_equals_the_unrolled_sum_and_its_gradient(mode):
+    inputs = make_inputs()
+    results = []
+    for run in (lambda i: sum_taps(tap, mode, 6, i), lambda i: unrolled(i, 6, mode)):
+        leaves = {k: v.clone().requires_grad_() for k, v in inputs.items()}
+        color, weight = run(leaves)
+        (color / weight).square().sum().backward()
+        grads = [v.grad if v.grad is not None else torch.zeros_like(v) for v in leaves.values()]
+        results.append([color, weight, *grads])
+    for ours, theirs in zip(*results, strict=True):
+        assert torch.allclose(ours, theirs, atol=1e-10)
+
+
+def test_only_what_needs_a_gradient_gets_one():
+    inputs = make_inputs()
+    inputs["decay"].requires_grad_()
+    color, _ = sum_taps(tap, "nearest", 4, inputs)
+    color.sum().backward()
+    assert inputs["decay"].grad is not None
+    assert inputs["image"].grad is None
+    with torch.no_grad():
+        assert not sum_taps(tap, "nearest", 4, inputs)[0].requires_grad
+
+
+def test_unknown_engine():
+    with pytest.raises(ConfigError, match="`engine` must be 'eager' or 'compiled', got 'fast'"):
+        sum_taps(tap, "nearest", 4, make_inputs(), "fast")
+
+
+_NO_COMPILER = """
+import warnings, torch
+import torch._inductor.compile_fx
+from torch._inductor.exc import InductorError
+import torchblur.ops.taps
+
+def broken(*_, **__):
+    def call(*_, **__):
+        raise InductorError(RuntimeError("no C++ compiler"), None)
+    return call
+
+torch.compile = broken
+from torchblur.filters import get_filter
+from torchblur.testing.frames import moving_square
+frame = moving_square()
+with warnings.catch_warnings(record=True) as caught:
+    warnings.simplefilter("always")
+    blur = get_filter("line")(engine="compiled")
+    images = [blur(frame) for _ in range(3)]
+assert torch.equal(images[0], get_filter("line")()(frame))
+texts = [str(w.message) for w in caught if "torch.compile does not work here" in str(w.message)]
+assert len(texts) == 1, texts
+"""
+
+
+def test_without_a_compiler_there_is_one_notice_and_the_eager_result():
+    done = subprocess.run(
+        [sys.executable, "-c", _NO_COMPILER], capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+
+
+def peak_tap(index, count, inputs, options):
+    x, y = pixel_grid(inputs["image"])
+    color = lookup(inputs["image"], x + index * inputs["step"], y, options)
+    return color, color * inputs["decay"]
+
+
+@pytest.mark.parametrize("num_maxima", [0, 1, 2])
+def test_the_last_accumulators_can_be_maxima(num_maxima):
+    inputs = make_inputs() | {"step": torch.tensor(1.0, dtype=torch.float64)}
+    results = []
+    for by_engine in (True, False):
+        leaves = {k: v.clone().requires_grad_() for k, v in inputs.items()}
+        if by_engine:
+            totals = sum_taps(peak_tap, "nearest", 6, leaves, num_maxima=num_maxima)
+        else:
+            parts = [
+                peak_tap(torch.tensor(float(i)).double(), None, leaves, "nearest") for i in range(6)
+            ]
+            stacked = [torch.stack(p) for p in zip(*parts, strict=True)]
+            totals = [s.sum(0) if i < 2 - num_maxima else s.amax(0) for i, s in enumerate(stacked)]
+        # Border pixels are met more than once: how amax divides a tie is not our affair.
+        sum(t[..., :4].square().sum() for t in totals).backward()
+        results.append([*totals, leaves["image"].grad, leaves["decay"].grad])
+    for ours, theirs in zip(*results, strict=True):
+        assert torch.allclose(ours, theirs, atol=1e-10)
+
+
+def test_a_tied_maximum_gives_its_gradient_to_one_tap():
+    image = torch.ones(1, 1, 2, 3, dtype=torch.float64)
+    leaves = {"image": image, "step": image.new_tensor(1.0)}
+    leaves["decay"] = image.new_tensor(2.0).requires_grad_()
+    _, peak = sum_taps(peak_tap, "nearest", 5, leaves, num_maxima=1)
+    peak.sum().backward()
+    assert float(leaves["decay"].grad) == 6.0

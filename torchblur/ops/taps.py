@@ -1,0 +1,252 @@
+"""The engine of all gathers: a sum over taps whose memory does not grow with their number.
+
+As the accumulators are sums, the incoming gradient is the same for every tap: the backward pass
+runs over the taps again and stores nothing per tap. The same tap function runs eagerly or
+compiled; its index and their number are tensors, so that neither compiles anew.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+from collections.abc import Callable, Hashable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import torch
+from torch import Tensor
+
+from torchblur.errors import ConfigError
+from torchblur.ops.compiling import compiler_errors, load_compiler, warn_no_compiler
+
+__all__ = ["Added", "Engine", "Inputs", "Planes", "TapFunction", "sum_taps"]
+
+Engine = Literal["eager", "compiled"]
+Inputs = dict[str, Tensor]
+Planes = tuple[Tensor, ...]
+Added = tuple[Tensor | Planes, ...]
+"""What a tap adds to each accumulator: a tensor, or planes that belong together."""
+TapFunction = Callable[[Tensor, Tensor, Inputs, Any], Added]
+"""``tap(index, count, inputs, options)``: index and count are 0-d float tensors."""
+
+
+def sum_taps(
+    tap: TapFunction,
+    options: Hashable,
+    num_samples: int,
+    inputs: Mapping[str, Tensor],
+    engine: Engine = "eager",
+    *,
+    num_maxima: int = 0,
+) -> Planes:
+    """Return the sums over ``num_samples`` taps of what the tap function returns.
+
+    Args:
+        tap: A module-level function of plain torch operations. It may use nothing but its
+            arguments: whatever needs a gradient must be in `inputs`.
+        options: Switches for the tap function, hashable; each set is compiled once.
+        num_samples: Number of taps, N >= 1.
+        inputs: Tensors by name, of any shapes that the tap agrees with.
+        engine: "eager", or "compiled" to compile the tap function with `torch.compile`; without
+            a compiler there is one warning and the eager result.
+        num_maxima: So many accumulators, the last ones, are maxima over the taps, not sums.
+
+    Returns:
+        The accumulators; where the tap returns a tuple of planes, they are joined along
+        dimension 1.
+
+    Differentiable: once, in all floating `inputs`, with memory independent of N. Backward costs
+        about one forward and backward of each tap. The gradient of a maximum goes to the first
+        tap that reaches it.
+
+    Raises:
+        ConfigError: if the engine has another name.
+    """
+    if engine not in ("eager", "compiled"):
+        raise ConfigError(f"`engine` must be 'eager' or 'compiled', got {engine!r}")
+    given = dict(inputs)
+    signature = tuple((name, t.shape, t.dtype) for name, t in given.items())
+    form = _form_of(tap, options, signature, num_maxima)
+    # The compiler makes special cases of 0 and 1; so few pixels gain nothing by it.
+    if any(0 in shape for shape in form.shapes):
+        engine = "eager"
+    for candidate in ("compiled", "eager") if engine == "compiled" else ("eager",):
+        kernel = _kernel(tap, options, candidate, form.num_summed)
+        try:
+            return form.joined(_run(kernel, num_samples, form, given))
+        except compiler_errors() as error:
+            if candidate == "eager":
+                raise
+            warn_no_compiler((str(error).splitlines() or [type(error).__name__])[0])
+    raise AssertionError("unreachable")
+
+
+@dataclass(frozen=True)
+class _Form:
+    """What a tap returns, laid flat.
+
+    Args:
+        shapes: Of each plane.
+        widths: Number of planes of each accumulator; 0: a tensor, not a tuple of planes.
+        num_summed: Number of planes that are sums; the rest are maxima.
+    """
+
+    shapes: tuple[torch.Size, ...]
+    widths: tuple[int, ...]
+    num_summed: int
+
+    def start(self, like: Tensor) -> Planes:
+        """Return the accumulators before the first tap."""
+        return tuple(
+            like.new_full(shape, 0.0 if i < self.num_summed else -math.inf)
+            for i, shape in enumerate(self.shapes)
+        )
+
+    def joined(self, planes: Sequence[Tensor]) -> Planes:
+        """Return one tensor for each accumulator."""
+        rest = iter(planes)
+        return tuple(
+            torch.cat([next(rest) for _ in range(width)], 1) if width else next(rest)
+            for width in self.widths
+        )
+
+
+def _flat(added: Added) -> Planes:
+    planes: list[Tensor] = []
+    for part in added:
+        planes += part if isinstance(part, tuple) else (part,)
+    return tuple(planes)
+
+
+@functools.lru_cache(maxsize=256)
+def _form_of(
+    tap: TapFunction,
+    options: Hashable,
+    signature: tuple[tuple[str, torch.Size, torch.dtype], ...],
+    num_maxima: int,
+) -> _Form:
+    """Find out what a tap returns, by calling it with tensors that have no values."""
+    inputs = {
+        name: torch.empty(shape, dtype=dtype, device="meta") for name, shape, dtype in signature
+    }
+    index = torch.empty((), dtype=_floating(inputs).dtype, device="meta")
+    added = tap(index, index, inputs, options)
+    widths = tuple(len(part) if isinstance(part, tuple) else 0 for part in added)
+    summed = sum(max(width, 1) for width in widths[: len(widths) - num_maxima])
+    return _Form(tuple(plane.shape for plane in _flat(added)), widths, summed)
+
+
+def _floating(inputs: Inputs) -> Tensor:
+    """Return the first floating tensor: its type and device are those of the sums."""
+    return next(t for t in inputs.values() if t.is_floating_point())
+
+
+@dataclass(frozen=True)
+class _Kernel:
+    """One tap, forward and backward, eager or compiled."""
+
+    add: Callable[[Planes, Tensor, Tensor, Inputs], Planes]
+    pull: Callable[..., tuple[Inputs, Planes]]
+
+
+def _run(kernel: _Kernel, num_samples: int, form: _Form, inputs: Inputs) -> Planes:
+    if torch.is_grad_enabled() and any(t.requires_grad for t in inputs.values()):
+        return _apply(kernel, num_samples, form, tuple(inputs), *inputs.values())
+    return _sum(kernel, num_samples, form, inputs)
+
+
+class _SumTaps(torch.autograd.Function):
+    """Sum over taps whose backward recomputes each tap."""
+
+    @staticmethod
+    def forward(
+        ctx: Any,
+        kernel: _Kernel,
+        num_samples: int,
+        form: _Form,
+        names: tuple[str, ...],
+        *tensors: Tensor,
+    ) -> Planes:
+        ctx.kernel, ctx.num_samples, ctx.names = kernel, num_samples, names
+        sums = _sum(kernel, num_samples, form, dict(zip(names, tensors, strict=True)))
+        ctx.save_for_backward(*tensors, *sums[form.num_summed :])
+        return sums
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
+        needed = ctx.needs_input_grad[4:]
+        tensors = [tensor.detach() for tensor in ctx.saved_tensors]
+        saved, peaks = tensors[: len(needed)], tuple(tensors[len(needed) :])
+        named = dict(zip(ctx.names, saved, strict=True))
+        wanted = {n: named[n] for n, w in zip(ctx.names, needed, strict=True) if w}
+        others = {n: t for n, t in named.items() if n not in wanted}
+        totals = {name: torch.zeros_like(t) for name, t in wanted.items()}
+        taken = tuple(torch.zeros_like(peak, dtype=torch.bool) for peak in peaks)
+        indices, number = _indices(ctx.num_samples, _floating(named))
+        for index in indices:
+            totals, taken = ctx.kernel.pull(
+                totals, taken, index, number, wanted, others, grads, peaks
+            )
+        return (None,) * 4 + tuple(totals.get(name) for name in ctx.names)
+
+
+_apply: Callable[..., Planes] = _SumTaps.apply
+
+
+@torch.no_grad()
+def _sum(kernel: _Kernel, num_samples: int, form: _Form, inputs: Inputs) -> Planes:
+    like = _floating(inputs)
+    inputs = {name: tensor.detach() for name, tensor in inputs.items()}
+    sums = form.start(like)
+    indices, number = _indices(num_samples, like)
+    for index in indices:
+        sums = kernel.add(sums, index, number, inputs)
+    return sums
+
+
+def _indices(num_samples: int, like: Tensor) -> tuple[Planes, Tensor]:
+    """Return the taps' indices and their number as 0-d tensors, made without waiting."""
+    numbers = torch.arange(num_samples + 1, device=like.device).to(like.dtype)
+    return numbers[:-1].unbind(0), numbers[-1]
+
+
+@functools.lru_cache(maxsize=128)
+def _kernel(tap: TapFunction, options: Hashable, engine: Engine, num_summed: int) -> _Kernel:
+    """Return the functions of one tap; one object for each structure."""
+
+    def add(sums: Planes, index: Tensor, count: Tensor, inputs: Inputs) -> Planes:
+        pairs = tuple(zip(sums, _flat(tap(index, count, inputs, options)), strict=True))
+        total = tuple(s + a for s, a in pairs[:num_summed])
+        return total + tuple(torch.maximum(s, a) for s, a in pairs[num_summed:])
+
+    def pull(  # noqa: PLR0913 - a closed function: all it touches is passed
+        totals: Inputs,
+        taken: Planes,
+        index: Tensor,
+        count: Tensor,
+        wanted: Inputs,
+        others: Inputs,
+        grads: Planes,
+        peaks: Planes,
+    ) -> tuple[Inputs, Planes]:
+        def one_tap(leaves: Inputs) -> Planes:
+            added = _flat(tap(index, count, others | leaves, options))
+            return tuple(a.expand_as(g) for a, g in zip(added, grads, strict=True))
+
+        values, vjp, *_ = torch.func.vjp(one_tap, wanted)
+        first = []
+        for value, peak, before in zip(values[num_summed:], peaks, taken, strict=True):
+            # Recomputed by another graph, a value may differ in its last bits.
+            first.append((value >= peak - 1e-6 * peak.abs()) & ~before)
+        due = grads[:num_summed] + tuple(
+            g * f for g, f in zip(grads[num_summed:], first, strict=True)
+        )
+        (parts,) = vjp(due)
+        taken = tuple(t | f for t, f in zip(taken, first, strict=True))
+        return {name: totals[name] + parts[name] for name in totals}, taken
+
+    if engine == "compiled":
+        load_compiler()
+        return _Kernel(torch.compile(add, dynamic=True), torch.compile(pull, dynamic=True))
+    return _Kernel(add, pull)
