@@ -145,3 +145,15 @@ def test_it_comes_nearer_to_a_path_traced_reference(shared_data, case, name, gai
     assert float(known["psnr_band"]) > float(guessed["psnr_band"]) + gain
     assert float(known["flip_band"]) < float(guessed["flip_band"])
     assert float(known["ssim_band"]) > float(guessed["ssim_band"])
+
+
+@pytest.mark.parametrize("name", FILTERS)
+def test_a_layer_with_holes_does_no_harm_where_the_frame_shows_it(name):
+    frame, _ = disk_scene(flow=16.0)
+    # Traced in stripes of the background alone: nothing that the disk hides.
+    known = ((torch.arange(88) // 4) % 2 == 0).view(1, 1, 1, 88) & (frame.object_id != 7)
+    holes = dataclasses.replace(frame.revealed, valid=known)
+    guessed = blur(name, frame)
+    assert torch.allclose(
+        blur(name, dataclasses.replace(frame, revealed=holes), background="revealed"), guessed
+    )

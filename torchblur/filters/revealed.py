@@ -111,7 +111,7 @@ def revealed_inputs(
 
     Returns:
         "revealed" (B, 3, H, W), the layer's blurred color; "open" (B, 1, H, W), 1 where the frame
-        shows the layer itself, also as "texture_open"; "behind", the slope of `behind_slope`.
+        shows the layer itself and the layer has no holes, also as "texture_open"; "behind", the slope of `behind_slope`.
 
     Differentiable: in color, in the depth of both, and in `background_depth`.
     Raises: FrameError if there is no revealed layer, or it has no depth.
@@ -119,7 +119,9 @@ def revealed_inputs(
     if values.background == "guessed":
         return {}
     layer, valid = layer_behind(frame)
-    shown = torch.where(_gap(frame, layer) > _LEAST_STEP, 0.0, valid)
+    # A layer with holes is blurred from what there is of it, which would show beside the object.
+    whole = valid.amin((1, 2, 3), keepdim=True)
+    shown = torch.where(_gap(frame, layer) > _LEAST_STEP, 0.0, whole.expand_as(valid))
     return {
         "revealed": blur(layer, Values(**(vars(values) | {"background": "guessed"}))),
         "open": shown,
