@@ -1,7 +1,7 @@
 """Adam in the unit cube, all starts as one batch of parameter sets.
 
 The first start is at the start values, the second at the best of earlier methods if that is asked
-for, the others are drawn from the cube. After each step the points are moved back into the cube.
+for (a single start is at that best), the others are drawn from the cube. After each step the points are moved back into the cube.
 Each step depends on the checkpoint, the seed and the step's number alone, so that a run that was
 killed ends where it would have ended.
 """
@@ -208,9 +208,9 @@ class _State:
 
 
 def _starts(job: GradientJob) -> Tensor:
-    """Return the first points, (K, P): the given ones, then random ones."""
+    """Return the first points, (K, P): the given ones (if too many, the last), then random ones."""
     count = max(job.method.starts, 1)
-    given = [job.space.to_unit(point) for point in job.first][:count]
+    given = [job.space.to_unit(point) for point in job.first][-count:]
     generator = torch.Generator().manual_seed(seed_of(job.seed, job.index, 1 << 40))
     drawn = torch.rand(
         (count - len(given), len(job.space.names)), generator=generator, dtype=torch.float64

@@ -117,3 +117,8 @@ def test_spreads():
     for spread in (-0.1, 1.5, float("nan")):
         with pytest.raises(ConfigError, match=f"`spread` must lie in .*got {spread:g}"):
             TwoPassBlur(blur, spread=spread)
+
+
+def test_a_filter_with_a_memory_is_refused():
+    with pytest.raises(ConfigError, match="single frames, got `oberberger2022`, which has a memo"):
+        TwoPassBlur(get_filter("oberberger2022")(), spread=0.1)

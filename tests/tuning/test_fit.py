@@ -264,7 +264,8 @@ class TestRun:
         assert finished.result.params == without.params
         assert any("no hold-out" in note for note in without.notes)
 
-    def test_sequence_of_methods(self, planted_folders, tmp_path):
+    @pytest.mark.parametrize("starts", [1, 2])
+    def test_sequence_of_methods(self, planted_folders, tmp_path, starts):
         """The gradient goes on from the search, with what it cannot fit as the search left it."""
         planted_folders["filter"]["free"] = {
             "kappa": {}, "third_gain": {}, "tile_size": {"choices": [6, 12]},
@@ -273,14 +274,14 @@ class TestRun:
         planted_folders["methods"] = [
             {"kind": "blackbox", "sampler": "random", "trials": 6},
             {
-                "kind": "gradient", "steps": 3, "starts": 2, "continue_from_best": True,
+                "kind": "gradient", "steps": 3, "starts": starts, "continue_from_best": True,
                 "free": ["kappa", "third_gain"],
             },
         ]  # fmt: skip
         result = run_fit(build(TuneConfig, planted_folders), tmp_path / "run")
         search, gradient = result.methods
         assert gradient.params["tile_size"] == search.params["tile_size"]
-        assert gradient.starts[1].first["kappa"] == pytest.approx(search.params["kappa"], rel=1e-5)
+        assert gradient.starts[-1].first["kappa"] == pytest.approx(search.params["kappa"], rel=1e-5)
         assert gradient.objective <= search.objective
         assert result.chosen == "gradient"
 

@@ -82,8 +82,11 @@ def tan2022(frame: Frame, config: Tan2022Config | None = None, **params: Any) ->
         after the frame uncovers lies behind the motion, so the mask looks where the taps go (a
         pixel's next position, as in the paper, belongs to `trailing`); a centered shutter
         samples both sides, and the mask looks both ways, half as far; how the two layers are
-        weighted (`background_weight`); depth is positive; taps are jittered; the center weight
-        is McGuire's; a still pixel keeps the velocity 0 and only its length is floored.
+        weighted (a tap's weight goes to the revealed layer by how far it lies on the way from
+        the pixel to that layer, see `background_depth`); depth is positive; taps lie at
+        ``(i + ½ + j) / N`` of the dominant displacement, with a jitter j; none is skipped in the
+        middle of a centered shutter; the center weight is McGuire's; a still pixel keeps the
+        velocity 0, and the floor `min_length` holds for the whole displacement.
     Raises: ConfigError for a bad parameter, FrameError if a layer has no depth.
     Warns: UserWarning, if the frame has no revealed layer, object numbers or normals.
     """
@@ -96,8 +99,8 @@ class Tan2022Blur(BlurFilter):
 
     It warns once of each layer that it does without. `layers` adds "ray_mask" (where a renderer
     should trace), "edge_mask", "candidates", "hybrid" (where the revealed layer was used; 0
-    without one), "foreground_weight" and "background_weight" (sums over the raster's taps, all
-    (B, 1, H, W)), "background" (the revealed layer's blurred color, (B, 3, H, W), if there is
+    without one, and where it hides nothing), "foreground_weight" and "background_weight" (sums
+    over the raster's taps, of use where the tile moves, all (B, 1, H, W)), "background" (the revealed layer's blurred color, (B, 3, H, W), if there is
     one), and "tile_max" and "neighbor_max" (half displacement in px, (B, 2, Ty, Tx)).
     """
 

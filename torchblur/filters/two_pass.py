@@ -8,7 +8,7 @@ from typing import Any
 from torch import Tensor, nn
 
 from torchblur.errors import ConfigError
-from torchblur.filters.base import BlurFilter
+from torchblur.filters.base import BlurFilter, TemporalBlur
 from torchblur.frame import Frame
 from torchblur.params import Param, declared
 
@@ -40,7 +40,8 @@ class TwoPassBlur(nn.Module):
         second pass lies around the pixel even where the shutter is not centered, and has its own
         noise. Velocities longer than a tile are cut in the first pass only, so that there the
         second reaches somewhat farther than the gaps.
-    Raises: ConfigError for a spread out of range, or none for a filter without `num_samples`.
+    Raises: ConfigError for a spread out of range, none for a filter without `num_samples`, or a
+        filter with a memory.
 
     Example:
         >>> from torchblur.filters import get_filter
@@ -50,6 +51,10 @@ class TwoPassBlur(nn.Module):
 
     def __init__(self, blur: BlurFilter, *, spread: float | None = None) -> None:
         super().__init__()
+        if isinstance(blur, TemporalBlur):
+            raise ConfigError(
+                f"two passes need a filter of single frames, got `{blur.name}`, which has a memory"
+            )
         if spread is not None:
             _SPREAD.check("spread", spread)
         elif not hasattr(blur.config, "num_samples"):
