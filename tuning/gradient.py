@@ -1,9 +1,9 @@
 """Adam in the unit cube, all starts as one batch of parameter sets.
 
 The first start is at the start values, the second at the best of earlier methods if that is asked
-for (a single start is at that best), the others are drawn from the cube. After each step the points are moved back into the cube.
-Each step depends on the checkpoint, the seed and the step's number alone, so that a run that was
-killed ends where it would have ended.
+for (a single start is at that best), the others are drawn from the cube. After each step the points
+are moved back into the cube. Each step depends on the checkpoint, the seed and the step's number
+alone, so that a run that was killed ends where it would have ended.
 """
 
 from __future__ import annotations

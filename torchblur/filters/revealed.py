@@ -111,7 +111,8 @@ def revealed_inputs(
 
     Returns:
         "revealed" (B, 3, H, W), the layer's blurred color; "open" (B, 1, H, W), 1 where the frame
-        shows the layer itself and the layer has no holes, also as "texture_open"; "behind", the slope of `behind_slope`.
+        shows the layer itself and the layer has no holes, also as "texture_open"; "behind", the
+        slope of `behind_slope`.
 
     Differentiable: in color, in the depth of both, and in `background_depth`.
     Raises: FrameError if there is no revealed layer, or it has no depth.

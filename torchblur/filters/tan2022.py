@@ -100,8 +100,9 @@ class Tan2022Blur(BlurFilter):
     It warns once of each layer that it does without. `layers` adds "ray_mask" (where a renderer
     should trace), "edge_mask", "candidates", "hybrid" (where the revealed layer was used; 0
     without one, and where it hides nothing), "foreground_weight" and "background_weight" (sums
-    over the raster's taps, of use where the tile moves, all (B, 1, H, W)), "background" (the revealed layer's blurred color, (B, 3, H, W), if there is
-    one), and "tile_max" and "neighbor_max" (half displacement in px, (B, 2, Ty, Tx)).
+    over the raster's taps, of use where the tile moves, all (B, 1, H, W)), "background" (the
+    revealed layer's blurred color, (B, 3, H, W), if there is one), and "tile_max" and
+    "neighbor_max" (half displacement in px, (B, 2, Ty, Tx)).
     """
 
     name = "tan2022"
