@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import sys
 import warnings
+from collections.abc import Callable
 from pathlib import Path
 
 import torch
@@ -36,7 +37,7 @@ def main() -> None:
     """Render the scenes of the README and write one picture for each."""
     folder = Path(sys.argv[1]) if len(sys.argv) > 1 else _ROOT / "docs" / "images"
     folder.mkdir(parents=True, exist_ok=True)
-    pictures = {
+    pictures: dict[str, Callable[[], Image.Image]] = {
         "towards_viewer": lambda: tuned_beside_published("towards_viewer"),
         "fence": lambda: tuned_beside_published("fence"),
         "vase_cushion": what_lies_behind,
@@ -115,7 +116,7 @@ def one_sample_per_pixel(
     renderer = Renderer(scene, images=frames)
     stream = Sequence(tuple(renderer.stream(size, frame=i)[0] for i in range(frames)))
     last = frames - 1
-    presets = {
+    presets: dict[str, str | Path] = {
         "Oberberger 2022, as published": "oberberger2022",
         "Oberberger 2022, tuned": _FILTERS / "oberberger2022-tuned.yaml",
     }
