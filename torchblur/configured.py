@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from torchblur.errors import ConfigError, nearest_name
-from torchblur.params import Config, build, declared
+from torchblur.params import Config, Param, build, declared
 
 __all__ = ["ConfiguredModule", "Values", "batch_size_of"]
 
@@ -53,7 +53,8 @@ class ConfiguredModule(nn.Module):
         Raises:
             ConfigError: if a parameter has left its range; `project_` brings it back.
         """
-        now = {key: float(getattr(self, key).detach()) for key in self._numbers()}
+        specs = declared(self.config_class)
+        now = {key: _as_declared(getattr(self, key), specs[key]) for key in self._numbers()}
         return build(self.config_class, self.config.model_dump() | now, place=self.name)
 
     @torch.no_grad()
@@ -110,6 +111,13 @@ class ConfiguredModule(nn.Module):
                 f"`{key}` must broadcast to (B, 1, H, W) = {want}, got shape {tuple(value.shape)}"
             )
         return value
+
+
+def _as_declared(value: Tensor, spec: Param) -> float:
+    """Return a number; what a float32 makes of an end of the range is that end."""
+    number = float(value.detach())
+    ends = (end for end in spec.bounds if number == float(value.new_tensor(end)))
+    return next(ends, number)
 
 
 def batch_size_of(values: Values, given: int) -> int:

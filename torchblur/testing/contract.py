@@ -235,7 +235,9 @@ class FilterContract:
             low, high = spec.bounds
             kind = self.filter_class.config_class.model_fields[name].annotation
             for end in (low, high):
-                self.blur(**{name: kind(end) if kind else end})
+                blur = self.blur(**{name: kind(end) if kind else end})
+                # float32 must not put the end of a range outside of it
+                assert getattr(blur.current_config(), name) == end
             outside = (low - 1, high + 1) if kind is int else (low - 1e-3, high * 1.01, torch.nan)
             for value in outside:
                 with pytest.raises(ConfigError, match=f"`{name}`.*got"):
