@@ -83,7 +83,7 @@ def _speed(job: dict[str, Any], names: list[str] | None) -> list[dict[str, Any]]
         f"all pixels move, {os.cpu_count()} cores; medians of {job['runs']}"
     )
     print(
-        f"{'filter':<14}{'engine':<10}{'forward CPU s':>14}{'wall s':>8}"
+        f"{'filter':<16}{'engine':<10}{'forward CPU s':>14}{'wall s':>8}"
         f"{'fwd+bwd CPU s':>15}{'wall s':>8}{'first call s':>14}{'eager / it':>12}"
     )
     rows: list[dict[str, Any]] = []
@@ -93,7 +93,7 @@ def _speed(job: dict[str, Any], names: list[str] | None) -> list[dict[str, Any]]
             rows.append(row | {"filter": name, "engine": engine})
             eager = rows[-1 if engine == "eager" else -2]
             print(
-                f"{name:<14}{engine:<10}{row['cpu']:>14.2f}{row['wall']:>8.2f}"
+                f"{name:<16}{engine:<10}{row['cpu']:>14.2f}{row['wall']:>8.2f}"
                 f"{row['backward_cpu']:>15.2f}{row['backward_wall']:>8.2f}"
                 f"{row['first']:>14.1f}{eager['cpu'] / row['cpu']:>12.2f}"
             )
@@ -192,17 +192,20 @@ def _measure(job: dict[str, Any]) -> dict[str, Any]:
         color=torch.rand(1, 3, *size, generator=generator).requires_grad_(),
         velocity=torch.nn.functional.interpolate(coarse, size, mode="bilinear"),
         depth=torch.rand(1, 1, *size, generator=generator) + 1,
+        time=torch.rand(1, 1, *size, generator=generator),
     )
-    params = job.get("params") or {"num_samples": job["num_samples"]}
-    blur = get_filter(job["filter"])(None, engine=job["engine"], **params)
+    kind = get_filter(job["filter"])
+    has_taps = "num_samples" in kind.config_class.model_fields
+    params = job.get("params") or ({"num_samples": job["num_samples"]} if has_taps else {})
+    blur = kind(None, engine=job["engine"], **params)
 
     def forward() -> None:
         with torch.no_grad():
-            blur(frame)
+            blur.layers(frame)
 
     def backward() -> None:
         frame.color.grad = None
-        blur(frame).square().mean().backward()
+        blur.layers(frame)["color"].square().mean().backward()
 
     if job["what"] == "memory":
         base = _peak_mib()
