@@ -68,6 +68,14 @@ def test_lists_of_pixels_give_what_images_give(mode, batch_size, sets, share):
         assert torch.allclose(ours, theirs, atol=1e-10)
 
 
+def test_many_rows_are_interpolated_from_their_corners(monkeypatch):
+    inputs = make_inputs(3)
+    whole = gather(tap, "bilinear", 6, inputs)
+    monkeypatch.setattr("torchblur.ops.gather._MOST_ROWS", 0)
+    for ours, theirs in zip(gather(tap, "bilinear", 6, inputs), whole, strict=True):
+        assert torch.allclose(ours, theirs, atol=1e-12)
+
+
 def test_what_is_not_active_is_zero_and_not_computed():
     seen = []
 
