@@ -7,31 +7,26 @@ import platform
 import shlex
 import sys
 import time
-import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import torch
-
-from torchblur.errors import ConfigError
 from torchblur.filters import BlurFilter, get_filter
 from torchblur.presets import Preset, save_preset
 from tuning.blackbox import BlackBoxJob, fit_blackbox
-from tuning.cases import AnyCase, SequenceCase, check_needs
+from tuning.cases import AnyCase, SequenceCase
 from tuning.config import GradientMethod, TuneConfig, free_names, resolve
-from tuning.data import load_cases
 from tuning.evaluation import ceiling, score_cases, score_variant, sensitivities
 from tuning.gradient import GradientJob, fit_gradient
+from tuning.preparation import fit_device, prepare
 from tuning.problem import Problem
 from tuning.progress import Progress, ProgressEvent, Stage
 from tuning.report import write_report
 from tuning.result import CaseScore, FitResult, MethodResult, ParameterResult
 from tuning.runfolder import RunFolder, open_run
-from tuning.space import Space, make_space
+from tuning.space import Space
 from tuning.variants import Variant
-from tuning.windows import make_samples
 
 __all__ = ["run_fit"]
 
@@ -113,37 +108,21 @@ def run_fit(
 
 
 def _prepare(config: TuneConfig, folder: RunFolder, progress: Progress | None) -> _Setting:
-    device = _device(config.device)
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
-        cases = load_cases(config.data, device=device, report=_data_reporter(progress))
-    notes = tuple(dict.fromkeys(str(warning.message) for warning in caught))
-    if not config.data.holdout:
-        notes += ("There is no hold-out: these figures are of the frames that were fitted.",)
-    space = make_space(config.filter)
-    blur = get_filter(config.filter.kind)(engine=config.engine, **config.filter.params).to(device)
-    check_needs(blur, cases)
-    train = [case for case in cases if case.split == "train"]
-    tile_size = int(getattr(blur.config, "tile_size", 16))
-    samples = make_samples(
-        train, config.data.crops, tile_size=tile_size, seed=config.seed, blur=blur
-    )
-    for parameter in blur.parameters():
-        parameter.requires_grad_(False)
-    problem = Problem(blur, samples, config.objective, space.names)
-    for note in notes:
+    ready = prepare(config, _data_reporter(progress))
+    total = len(ready.cases)
+    for note in ready.notes:
         folder.log(note=note)
         if progress is not None:
-            progress(ProgressEvent(stage="data", done=len(cases), total=len(cases), message=note))
+            progress(ProgressEvent(stage="data", done=total, total=total, message=note))
     return _Setting(
         config=config,
         folder=folder,
         progress=progress,
-        space=space,
-        blur=blur,
-        cases=cases,
-        problem=problem,
-        notes=notes,
+        space=ready.space,
+        blur=ready.blur,
+        cases=ready.cases,
+        problem=ready.problem,
+        notes=ready.notes,
     )
 
 
@@ -209,7 +188,7 @@ def _variants(
 ) -> list[Variant]:
     """Return what is scored: frames, line, the filter as published, before and after the fit."""
     blur, free = setting.blur, setting.space.names
-    device = _device(setting.config.device)
+    device = fit_device(setting.config.device)
     variants = [Variant(name="sharp")]
     if any(isinstance(case, SequenceCase) for case in setting.cases):
         variants.append(Variant(name="input", stream=True))
@@ -330,18 +309,6 @@ def _versions() -> dict[str, str]:
     return {"python": platform.python_version()} | {
         name: importlib.metadata.version(name) for name in names
     }
-
-
-def _device(name: str) -> torch.device:
-    if name == "auto":
-        return torch.device("cuda" if torch.cuda.is_available() else "cpu")
-    try:
-        device = torch.device(name)
-        torch.empty(0, device=device)
-    except (RuntimeError, AssertionError) as error:
-        reason = str(error).splitlines()[0]
-        raise ConfigError(f"`device` {name!r} cannot be used: {reason}") from error
-    return device
 
 
 def _data_reporter(progress: Progress | None) -> Any:

@@ -188,7 +188,7 @@ def test_torn_lines_of_a_killed_writer(config, tmp_path, whole):
 
 def test_finished_run_is_not_done_again(config, tmp_path, monkeypatch):
     first = run_fit(config, tmp_path / "run")
-    monkeypatch.setattr(tuning.fit, "load_cases", None)
+    monkeypatch.setattr(tuning.fit, "prepare", None)
     assert run_fit(config, tmp_path / "run", resume=True) == first
 
 

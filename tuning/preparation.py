@@ -1,0 +1,90 @@
+"""What a configuration stands for: its frames, its filter, its free parameters, its objective."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+
+from torchblur.errors import ConfigError
+from torchblur.filters import BlurFilter, get_filter
+from tuning.cases import AnyCase, check_needs
+from tuning.config import TuneConfig
+from tuning.data import load_cases
+from tuning.problem import Problem
+from tuning.space import Space, make_space
+from tuning.windows import make_samples
+
+__all__ = ["Prepared", "fit_device", "prepare"]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Prepared:
+    """What a fit works on.
+
+    Args:
+        space: The free parameters.
+        blur: The filter, on its device; its parameters need no gradient.
+        cases: Frames and sequences of both splits.
+        problem: The objective on the training frames.
+        notes: What the user should know of the data.
+    """
+
+    space: Space
+    blur: BlurFilter
+    cases: list[AnyCase]
+    problem: Problem
+    notes: tuple[str, ...]
+
+
+def prepare(config: TuneConfig, report: Callable[[int, int, str], None] | None = None) -> Prepared:
+    """Load the data of a resolved configuration and make its filter and its objective.
+
+    The same configuration and data give the same windows in every process.
+
+    Args:
+        config: What `resolve` or `load_tune_config` returned.
+        report: Called with (done, total, name of the next case).
+
+    Raises:
+        ConfigError: no such device; data that the filter cannot use.
+        TorchblurError: data that is missing or cannot be read.
+    """
+    device = fit_device(config.device)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        cases = load_cases(config.data, device=device, report=report)
+    notes = tuple(dict.fromkeys(str(warning.message) for warning in caught))
+    if not config.data.holdout:
+        notes += ("There is no hold-out: these figures are of the frames that were fitted.",)
+    space = make_space(config.filter)
+    blur = get_filter(config.filter.kind)(engine=config.engine, **config.filter.params).to(device)
+    check_needs(blur, cases)
+    train = [case for case in cases if case.split == "train"]
+    tile_size = int(getattr(blur.config, "tile_size", 16))
+    samples = make_samples(
+        train, config.data.crops, tile_size=tile_size, seed=config.seed, blur=blur
+    )
+    for parameter in blur.parameters():
+        parameter.requires_grad_(False)
+    problem = Problem(blur, samples, config.objective, space.names)
+    return Prepared(space=space, blur=blur, cases=cases, problem=problem, notes=notes)
+
+
+def fit_device(name: str) -> torch.device:
+    """Return a device by its name; "auto" is a GPU if there is one.
+
+    Raises:
+        ConfigError: no such device here.
+    """
+    if name == "auto":
+        return torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    try:
+        device = torch.device(name)
+        torch.empty(0, device=device)
+    except (RuntimeError, AssertionError) as error:
+        reason = str(error).splitlines()[0]
+        raise ConfigError(f"`device` {name!r} cannot be used: {reason}") from error
+    return device
