@@ -20,6 +20,8 @@ from torchblur.ops.gather import Engine
 from torchblur.params import Config, build, choices, declared
 from torchblur.presets import load_preset
 from tuning.data_config import DataSpec
+from tuning.method_config import BlackBoxMethod, GradientMethod, Method, check_method
+from tuning.objective_config import ObjectiveSpec
 from tuning.overrides import apply_overrides
 
 __all__ = [
@@ -68,76 +70,6 @@ class FilterSpec(Config):
         if isinstance(value, dict):
             return {name: {} if item is None else item for name, item in value.items()}
         return value
-
-
-Metric = Literal["flip", "flip_hdr", "l1", "mse", "relative_l2", "ssim"]
-
-
-def _flip_alone() -> dict[Metric, float]:
-    return {"flip": 1.0}
-
-
-class ObjectiveSpec(Config):
-    """A weighted sum of error maps, averaged over the image and over the band at moving borders."""
-
-    terms: dict[Metric, Annotated[float, Field(gt=0)]] = Field(
-        default_factory=_flip_alone,
-        min_length=1,
-        description="weights; flip and flip_hdr have a color space of their own, ssim is 1 - SSIM",
-    )
-    color_space: Literal["linear", "srgb", "log"] = Field(
-        "srgb",
-        description="of l1, mse, relative_l2: radiance, clipped and sRGB-encoded, or log(1 + x)",
-    )
-    band_weight: float = Field(
-        0.0, ge=0, le=1, description="share of the band at moving borders; the rest is the image"
-    )
-    temporal: float = Field(
-        0.0,
-        ge=0,
-        description="of sequences: weight of the error of the change from frame to frame, "
-        "|(I_t - I_t-1) - (R_t - R_t-1)| in `color_space`",
-    )
-
-
-class _MethodBase(Config):
-    free: tuple[str, ...] | None = Field(
-        None, min_length=1, description="the free parameters that this method fits; all if left out"
-    )
-    continue_from_best: bool = Field(
-        False, description="begin at the best of the methods before it, beside the start values"
-    )
-
-
-class GradientMethod(_MethodBase):
-    """Adam in the unit cube, from several starts at once; for smooth parameters."""
-
-    kind: Literal["gradient"]
-    steps: int = Field(100, ge=1, description="steps of the optimizer")
-    starts: int = Field(4, ge=1, description="the first at the start values, the others random")
-    learning_rate: float = Field(
-        0.03, gt=0, le=1, description="first step, as a fraction of each range; falls by a cosine"
-    )
-    batch: int | None = Field(
-        None, ge=1, description="frames or windows of a step, drawn anew; all if left out"
-    )
-    unroll: int | None = Field(
-        None,
-        ge=1,
-        description="frames of a sequence that gradients go back through at most (truncated "
-        "backpropagation: memory for so many); all if left out",
-    )
-
-
-class BlackBoxMethod(_MethodBase):
-    """An Optuna sampler; for parameters of every class."""
-
-    kind: Literal["blackbox"]
-    sampler: Literal["tpe", "cmaes", "gp", "random"] = Field("tpe", description="Optuna's sampler")
-    trials: int = Field(100, ge=1, description="evaluations; the first at the start values")
-
-
-Method = Annotated[GradientMethod | BlackBoxMethod, Field(discriminator="kind")]
 
 
 class TuneConfig(Config):
@@ -227,21 +159,14 @@ def free_names(config: TuneConfig, index: int, place: str = "") -> tuple[str, ..
         ConfigError: unknown name, or one without a usable gradient.
     """
     method = config.methods[index]
-    where = f"({place}: methods.{index}.free)" if place else f"(methods.{index}.free)"
+    where = _join(place, f"methods.{index}")
     names = tuple(config.filter.free) if method.free is None else method.free
     specs = declared(get_filter(config.filter.kind).config_class)
     for name in names:
         if name not in config.filter.free:
             hint = nearest_name(name, config.filter.free)
-            raise ConfigError(f"`{name}` is not among the free parameters{hint} {where}")
-        grad = specs[name].grad
-        if method.kind == "gradient" and (
-            grad == "discrete" or (grad == "weak" and not method.free)
-        ):
-            raise ConfigError(
-                f"`{name}` is {grad} and has no usable gradient; fit it with a `blackbox` method, "
-                f"and name this method's own parameters in its `free` {where}"
-            )
+            raise ConfigError(f"`{name}` is not among the free parameters{hint} ({where}.free)")
+    check_method(method, names, specs, where)
     return names
 
 

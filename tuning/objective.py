@@ -1,4 +1,4 @@
-"""The error that a fit makes small: weighted maps, averaged over the image and the band."""
+"""The error that a fit makes small: weighted maps, averaged over the image and over the band."""
 
 from __future__ import annotations
 
@@ -16,18 +16,19 @@ from torchblur.metrics import (
     ssim,
     temporal_error,
 )
-from tuning.config import ObjectiveSpec
+from tuning.objective_config import ObjectiveSpec
 
 __all__ = ["PreparedObjective", "prepare_objective"]
 
 _RELATIVE_FLOOR = 0.01  # radiance² below which a relative error becomes absolute
+_BEST_MSE = 1e-6  # 60 dB: better than that is hardly told apart, and log(0) has no gradient
 
 
 class PreparedObjective:
     """An objective against one batch of references, filtered once and compared many times.
 
     Args:
-        spec: Terms, color space, share of the band.
+        spec: Terms of the image and of the band, color space, share of the band.
         reference: Scene-linear radiance, (M, 3, H, W).
         band: Band at moving borders, bool, (M, 1, H, W).
     """
@@ -37,11 +38,13 @@ class PreparedObjective:
         self._reference = reference
         self._encoded = _encode(reference, spec.color_space)
         self._flip: dict[str, FlipReference] = {}
-        if "flip" in spec.terms:
+        named = {**spec.terms, **spec.band}
+        if "flip" in named:
             self._flip["flip"] = prepare_flip_ldr(reference)
-        if "flip_hdr" in spec.terms:
+        if "flip_hdr" in named:
             self._flip["flip_hdr"] = prepare_flip_hdr(reference)
         self._weights = _weights(band, spec.band_weight)
+        self._inside = _weights(band, 1.0) if spec.band else None
 
     def __call__(self, image: Tensor) -> Tensor:
         """Return the objective of each image, (K,), at least 0.
@@ -53,8 +56,11 @@ class PreparedObjective:
         Differentiable: yes.
         """
         total = image.new_zeros(image.shape[0])
-        for metric, weight in self.spec.terms.items():
-            total = total + weight * masked_mean(self._map(metric, image), self._weights)
+        for metric in dict.fromkeys((*self.spec.terms, *self.spec.band)):
+            map = self._map(metric, image)
+            for weights, mask in ((self.spec.terms, self._weights), (self.spec.band, self._inside)):
+                if metric in weights:
+                    total = total + weights[metric] * _pooled(metric, masked_mean(map, mask))
         return total
 
     def change(self, image: Tensor, before: Tensor, previous: PreparedObjective) -> Tensor:
@@ -102,6 +108,11 @@ def _weights(band: Tensor, share: float) -> Tensor | None:
     return torch.where(mean > 0, (1 - share) + share * inside / mean.clamp_min(1e-12), 1.0)
 
 
+def _pooled(metric: str, mean: Tensor) -> Tensor:
+    """Return a term from the mean of its map: the mean itself, or of squares a logarithm."""
+    return torch.log10(1 + mean / _BEST_MSE) if metric == "psnr" else mean
+
+
 def _squared(image: Tensor, reference: Tensor) -> Tensor:
     return ((image - reference) ** 2).mean(dim=1, keepdim=True)
 
@@ -109,6 +120,7 @@ def _squared(image: Tensor, reference: Tensor) -> Tensor:
 _DIFFERENCES: dict[str, Callable[[Tensor, Tensor], Tensor]] = {
     "l1": lambda image, reference: (image - reference).abs().mean(dim=1, keepdim=True),
     "mse": _squared,
+    "psnr": _squared,
     "relative_l2": lambda image, reference: (
         (image - reference) ** 2 / (reference**2 + _RELATIVE_FLOOR)
     ).mean(dim=1, keepdim=True),

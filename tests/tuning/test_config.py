@@ -143,6 +143,14 @@ def test_bad_overrides(text, message):
         ),
         (changed(objective={"terms": {"flipp": 1.0}}), "flipp"),
         (changed(objective={"terms": {"flip": -1.0}}), "-1"),
+        (changed(objective={"terms": {}}), r"`terms` or `band` must name a metric.*x\.yaml: obj"),
+        (
+            changed(objective={"band": {"flip": 1.0}, "band_weight": 0.3}),
+            r"give weights of the `band`, or its share `band_weight`, not both.*x\.yaml: objective",
+        ),
+        (changed(objective={"band": {"psnrr": 1.0}}), r"psnrr.*x\.yaml: objective\.band\.psnrr"),
+        (changed(objective={"tail": 1.5}), r"`tail`: .*1, got 1\.5 \(x\.yaml: objective\.tail"),
+        (changed(objective={"reduction": "median"}), r"'mean', 'cvar' or 'worst', got 'median'"),
     ],
 )
 def test_mistakes_name_rule_value_and_place(tmp_path, monkeypatch, data, message):

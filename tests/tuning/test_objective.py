@@ -71,6 +71,44 @@ def test_band_gets_its_share(pair):
     assert float(got[1]) == pytest.approx(float(whole[1]), rel=1e-5)  # no band: all is image
 
 
+def test_terms_of_the_band_stand_beside_those_of_the_image(pair):
+    image, reference, band = pair
+    spec = ObjectiveSpec(terms={"l1": 2.0}, band={"l1": 0.5, "mse": 3.0}, color_space="linear")
+    got = prepare_objective(spec, reference, band)(image)
+    error = (image - reference).abs().mean(dim=1, keepdim=True)
+    squares = ((image - reference) ** 2).mean(dim=1, keepdim=True)
+    inside = [0.5 * float(e[0][band[0]].mean()) for e in (error, 2 * 3.0 * squares)]
+    assert float(got[0]) == pytest.approx(2.0 * float(error[0].mean()) + sum(inside), rel=1e-5)
+    # Without a band its terms are those of the whole image.
+    whole = 2.5 * float(error[1].mean()) + 3.0 * float(squares[1].mean())
+    assert float(got[1]) == pytest.approx(whole, rel=1e-5)
+
+
+def test_a_share_of_the_band_is_terms_of_both(pair):
+    image, reference, band = pair
+    share = ObjectiveSpec(terms={"flip": 1.0}, band_weight=0.25)
+    terms = ObjectiveSpec(terms={"flip": 0.75}, band={"flip": 0.25})
+    losses = [prepare_objective(spec, reference, band)(image) for spec in (share, terms)]
+    assert torch.allclose(*losses, rtol=1e-5)
+
+
+class TestPsnr:
+    def test_counts_ten_decibels_as_one(self):
+        reference = torch.full((1, 3, 8, 8), 0.5)
+        prepared = prepare_objective(single("psnr"), reference, torch.ones(1, 1, 8, 8) > 0)
+        losses = [float(prepared(reference + 10 ** (-db / 20))) for db in (20, 30, 40)]
+        assert losses[0] - losses[1] == pytest.approx(1.0, abs=1e-3)
+        assert losses == pytest.approx([(60 - db) / 10 for db in (20, 30, 40)], abs=5e-3)
+        assert float(prepared(reference)) == 0
+
+    def test_has_a_gradient_down_to_equality(self):
+        reference = torch.full((1, 3, 8, 8), 0.5, dtype=torch.float64)
+        prepared = prepare_objective(single("psnr"), reference, torch.ones(1, 1, 8, 8) > 0)
+        for error in (0.3, 0.01, 1e-5, 0.0):
+            image = torch.full_like(reference, 0.5 + error).requires_grad_(True)
+            assert torch.autograd.gradcheck(lambda i: prepared(i).double(), image, atol=1e-4)
+
+
 def problem_of(cases, objective, crops=None, free=tuple(PLANTED)):
     blur = get_filter("guertin2014")(**FIXED).requires_grad_(False)
     return Problem(blur, make_samples(cases, crops, tile_size=12, seed=0), objective, free)
