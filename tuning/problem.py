@@ -9,8 +9,9 @@ import torch
 from torch import Tensor
 
 from torchblur.filters import BlurFilter
-from tuning.config import ObjectiveSpec
 from tuning.groups import AnyGroup, join, kind_of
+from tuning.objective_config import ObjectiveSpec
+from tuning.reduction import tail_weights
 from tuning.windows import AnySample
 
 __all__ = ["Problem"]
@@ -43,7 +44,7 @@ class Problem:
         self.objective = objective
         self.free = tuple(free)
         self._single: dict[int, AnyGroup] = {}
-        self._joined: list[AnyGroup] | None = None
+        self._joined: list[tuple[list[int], AnyGroup]] | None = None
 
     def losses(
         self,
@@ -53,9 +54,11 @@ class Problem:
         *,
         unroll: int | None = None,
     ) -> Iterator[Tensor]:
-        """Yield parts of the mean objective of K parameter sets, (K,) each; their sum is the mean.
+        """Yield parts of the objective of K parameter sets, (K,) each; their sum is the objective.
 
         The parts come one by one, so that a caller can go backward through each and forget it.
+        With another reduction than the mean all windows are filtered once without a graph, to
+        find those that count for each set, and those again with one, if gradients are wanted.
 
         Args:
             values: (K,) tensors, or for K = 1 any single values, by name.
@@ -66,18 +69,46 @@ class Problem:
 
         Differentiable: yes. A set whose image is not finite gets NaN, the others are unharmed.
         """
-        positions = range(len(self.samples)) if chosen is None else chosen
-        groups = (
-            self._groups_of_one(positions) if count > 1 or chosen is not None else self._groups()
-        )
-        total = len(positions)
-        for group in groups:
+        number = len(self.samples) if chosen is None else len(chosen)
+        weights: Tensor | None = None
+        if self.objective.reduction != "mean":
+            each = self.each(values, count, chosen)
+            weights = tail_weights(each, self.objective)
+            if not torch.is_grad_enabled():
+                yield (weights * each).sum(dim=0)
+                return
+        for places, group in self._groups_for(count, chosen):
+            if weights is not None and not bool((weights[places] > 0).any()):
+                continue
             for losses in group.parts(self.blur, values, self.free, unroll):
-                yield (losses if count > 1 else losses.sum(dim=0, keepdim=True)) / total
+                if weights is None:
+                    yield (losses if count > 1 else losses.sum(dim=0, keepdim=True)) / number
+                else:
+                    rows = losses[None] if count > 1 else losses[:, None]
+                    yield (rows * weights[places].to(rows)).sum(dim=0)
+
+    @torch.no_grad()
+    def each(
+        self, values: Mapping[str, Any], count: int = 1, chosen: Sequence[int] | None = None
+    ) -> Tensor:
+        """Return the objective of each window for K parameter sets, (n, K), float64, on the CPU.
+
+        Args:
+            values: (K,) tensors, or for K = 1 any single values, by name.
+            count: K.
+            chosen: Positions of the windows; all if left out.
+        """
+        found: dict[int, Tensor] = {}
+        for places, group in self._groups_for(count, chosen):
+            parts = [p.double().cpu() for p in group.parts(self.blur, values, self.free)]
+            losses = torch.stack(parts).sum(dim=0)
+            columns = losses[:, None] if count == 1 else losses[None]
+            found |= zip(places, columns, strict=True)
+        return torch.stack([found[place] for place in range(len(found))])
 
     @torch.no_grad()
     def mean(self, values: Mapping[str, Any], count: int = 1) -> Tensor:
-        """Return the mean objective of K parameter sets over all windows, (K,), float64, CPU.
+        """Return the objective of K parameter sets over all windows, (K,), float64, CPU.
 
         Args:
             values: (K,) tensors, or for K = 1 any single values, by name.
@@ -92,27 +123,36 @@ class Problem:
             means.append(torch.stack([part.double().cpu() for part in parts]).sum(dim=0))
         return torch.cat(means)
 
-    def _groups_of_one(self, positions: Sequence[int]) -> Iterator[AnyGroup]:
-        for position in positions:
+    def _groups_for(
+        self, count: int, chosen: Sequence[int] | None
+    ) -> Iterator[tuple[list[int], AnyGroup]]:
+        """Yield windows that are filtered in one call, and where they stand among the chosen."""
+        if count == 1 and chosen is None:
+            yield from self._groups()
+            return
+        for place, position in enumerate(range(len(self.samples)) if chosen is None else chosen):
             if position not in self._single:
                 self._single[position] = join([self.samples[position]], self.objective)
-            yield self._single[position]
+            yield [place], self._single[position]
 
-    def _groups(self) -> list[AnyGroup]:
+    def _groups(self) -> list[tuple[list[int], AnyGroup]]:
         if self._joined is None:
-            self._joined = [join(samples, self.objective) for samples in self._alike()]
+            self._joined = [
+                (places, join([self.samples[place] for place in places], self.objective))
+                for places in self._alike()
+            ]
         return self._joined
 
-    def _alike(self) -> Iterator[list[AnySample]]:
-        """Yield windows of one kind, as many as go into one call."""
-        by_kind: dict[tuple[Any, ...], list[AnySample]] = {}
-        for sample in self.samples:
-            by_kind.setdefault(kind_of(sample), []).append(sample)
-        for samples in by_kind.values():
-            first = samples[0]
+    def _alike(self) -> Iterator[list[int]]:
+        """Yield positions of windows of one kind, as many as go into one call."""
+        by_kind: dict[tuple[Any, ...], list[int]] = {}
+        for place, sample in enumerate(self.samples):
+            by_kind.setdefault(kind_of(sample), []).append(place)
+        for places in by_kind.values():
+            first = self.samples[places[0]]
             most = max(1, _budget(first) // (first.size[0] * first.size[1]))
-            for start in range(0, len(samples), most):
-                yield samples[start : start + most]
+            for start in range(0, len(places), most):
+                yield places[start : start + most]
 
 
 def _budget(sample: AnySample) -> int:
