@@ -1,35 +1,41 @@
 """An Optuna study over the free parameters, of every class, kept in a journal in the run folder.
 
-The study is worked on in memory; each finished trial is added to the journal with one line. The
-sampler of a trial is seeded by the run's seed and the trial's number. So a study that was killed
-loses the trial in flight alone, draws it again with the same values, and ends as it would have.
+The study is worked on in memory, round by round: a round is one trial, or a population that is
+drawn before any of it is known, and what is polished of it. Each finished trial is added to the
+journal with one line. The sampler of a trial is seeded by the run's seed and the trial's number. So
+a study that was killed loses the round in flight alone, draws it again with the same values, and
+ends as it would have.
 """
 
 from __future__ import annotations
 
 import math
-import warnings
-from collections.abc import Iterator, Mapping
+import time
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
 import optuna
 import torch
-from optuna.samplers import BaseSampler, CmaEsSampler, GPSampler, RandomSampler, TPESampler
-from optuna.storages import InMemoryStorage, JournalStorage
-from optuna.storages.journal import JournalFileBackend
-from optuna.trial import FrozenTrial, Trial, TrialState
+from optuna.trial import FrozenTrial, Trial, TrialState, create_trial
 
-from tuning.config import BlackBoxMethod
+from tuning.blackbox_study import Journal, make_pruner, make_sampler, new_study, suggest
+from tuning.candidates import evaluate_candidates
+from tuning.fidelity import Climb, Ladder
 from tuning.gradient import FitError, seed_of
+from tuning.method_config import BlackBoxMethod
+from tuning.polish import Polished, is_promising, polish
 from tuning.problem import Problem
 from tuning.progress import Progress, Stage
 from tuning.result import MethodResult
-from tuning.runfolder import RunFolder, trim_torn_line
-from tuning.space import FreeParameter, Space
+from tuning.runfolder import RunFolder
+from tuning.space import Space
 
 __all__ = ["BlackBoxJob", "fit_blackbox"]
+
+_POLISHED = "polish_of"
+_WINDOWS_SEED, _POLISH_SEED = 1 << 41, 1 << 42
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -44,6 +50,7 @@ class BlackBoxJob:
         fixed: Values of the free parameters that it does not fit.
         first: Points to evaluate before the sampler's.
         seed: Seed of the run.
+        polished: Names of the parameters that are polished by gradient.
     """
 
     method: BlackBoxMethod
@@ -53,6 +60,7 @@ class BlackBoxJob:
     fixed: Mapping[str, Any]
     first: tuple[Mapping[str, Any], ...]
     seed: int
+    polished: tuple[str, ...] = ()
 
 
 def fit_blackbox(
@@ -73,104 +81,220 @@ def fit_blackbox(
         The best trial.
 
     Raises:
+        ConfigError: too few windows for the rungs of a pruner.
         FitError: no trial has a finite loss.
     """
-    optuna.logging.set_verbosity(optuna.logging.WARNING)
-    study = optuna.create_study(storage=InMemoryStorage())
-    journal = None if folder is None else _journal(folder, job.index)
-    for trial in journal.get_trials() if journal is not None else ():
-        study.add_trial(trial)
-    done = len(study.trials)
+    search = _Search(problem, job)
+    journal = None if folder is None else Journal(folder, job.index)
+    for trial in journal.trials() if journal is not None else ():
+        search.study.add_trial(trial)
     if folder is not None:
         folder.drop_records(job.index, 0)
-        for trial in study.trials:
+        for trial in search.study.trials:
             _log(folder, job, trial)
-    stage = Stage(job.name, job.method.trials, progress, done=done)
-    for number in range(done, job.method.trials):
-        trial = _run_trial(study, problem, job, number)
-        if folder is not None and journal is not None:
-            journal.add_trial(trial)
-            _log(folder, job, trial)
-        stage.step(number + 1, loss=trial.value, best=_best(study))
-    return _result(study, problem, job)
+    stage = Stage(job.name, job.method.trials, progress, done=search.drawn)
+    while search.drawn < job.method.trials:
+        trials = search.round()
+        for position, trial in enumerate(trials):
+            if folder is not None and journal is not None:
+                journal.add(trial, ends_round=position == len(trials) - 1)
+                _log(folder, job, trial)
+        last = [t.value for t in trials if t.state == TrialState.COMPLETE and t.value is not None]
+        stage.step(search.drawn, loss=min(last, default=None), best=search.best)
+    return search.result()
 
 
-def _journal(folder: RunFolder, index: int) -> optuna.Study:
-    path = folder.path / f"study-{index}.log"
-    # This process holds the run's own lock: what a killed one left here is stale.
-    trim_torn_line(path)
-    path.with_name(f"{path.name}.lock").unlink(missing_ok=True)
-    storage = JournalStorage(JournalFileBackend(str(path)))
-    return optuna.create_study(storage=storage, study_name="fit", load_if_exists=True)
+class _Search:
+    """The study, and what its next round depends on."""
+
+    def __init__(self, problem: Problem, job: BlackBoxJob) -> None:
+        self.problem, self.job = problem, job
+        pruning = job.method.pruning
+        self.ladder = (
+            None
+            if pruning is None
+            else Ladder(problem, pruning, seed_of(job.seed, job.index, _WINDOWS_SEED))
+        )
+        rungs = 1 if self.ladder is None else len(self.ladder.sizes)
+        self.study = new_study(make_pruner(job.method, rungs))
+
+    @property
+    def drawn(self) -> int:
+        """How many trials the sampler drew; what was polished of them is not counted."""
+        return sum(not _is_polished(t) for t in self.study.get_trials(deepcopy=False))
+
+    @property
+    def best(self) -> float | None:
+        """The least loss so far."""
+        trials = self.study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,))
+        return min((t.value for t in trials if t.value is not None), default=None)
+
+    def round(self) -> list[FrozenTrial]:
+        """Draw, evaluate, polish and tell; return the finished trials in order."""
+        began = _Clock()
+        trials = [self._ask(number) for number in range(self.drawn, self._end_of_round())]
+        drawing = began.cpu() / len(trials)
+        found = self._evaluate(trials)
+        losses = self._known_losses()
+        polished = []
+        for trial, climb in zip(trials, found, strict=True):
+            if not climb.pruned and math.isfinite(climb.loss):
+                polished.append(self._polish(trial, climb.loss, losses))
+                losses.append(climb.loss)
+            else:
+                polished.append(None)
+        for trial, climb in zip(trials, found, strict=True):
+            climb.cpu_seconds += drawing
+            trial.set_user_attr("seconds", began.wall() / len(trials))
+        told = [self._tell(*each) for each in zip(trials, found, polished, strict=True)]
+        for trial, after in zip(trials, polished, strict=True):
+            if after is not None and _is_new(after, trial):
+                self._add(trial, after)
+                told.append(self.study.get_trials()[-1])
+        return told
+
+    def _end_of_round(self) -> int:
+        """Given points are a round of their own, so that populations are whole."""
+        size, first, drawn = self.job.method.population, len(self.job.first), self.drawn
+        end = first if size > 1 and drawn < first else drawn + size
+        return min(end, self.job.method.trials)
+
+    def _ask(self, drawn: int) -> Trial:
+        job, number = self.job, len(self.study.get_trials(deepcopy=False))
+        self.study.sampler = make_sampler(job.method, seed_of(job.seed, job.index, number))
+        if drawn < len(job.first):
+            self.study.enqueue_trial({name: job.first[drawn][name] for name in job.space.names})
+        with _one_thread(job.method.sampler == "gp"):
+            trial = self.study.ask()
+            for parameter in job.space.parameters:
+                suggest(trial, parameter)
+        return trial
+
+    def _evaluate(self, trials: Sequence[Trial]) -> list[Climb]:
+        candidates = [trial.params for trial in trials]
+        space, fixed = self.job.space, self.job.fixed
+        if self.ladder is not None:
+            return self.ladder.climb(trials, space, fixed, candidates)
+        return [
+            Climb(loss=float(one.losses), cpu_seconds=one.cpu_seconds)
+            for one in evaluate_candidates(self.problem, space, fixed, candidates)
+        ]
+
+    def _known_losses(self) -> list[float]:
+        trials = self.study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,))
+        return [t.value for t in trials if t.value is not None and not _is_polished(t)]
+
+    def _polish(self, trial: Trial, loss: float, before: Sequence[float]) -> Polished | None:
+        job, spec = self.job, self.job.method.polish
+        if spec is None or not is_promising(loss, before, spec.quantile):
+            return None
+        seed = seed_of(job.seed, job.index, trial.number, _POLISH_SEED)
+        space = job.space.subset(job.polished)
+        return polish(self.problem, spec, space, job.fixed, trial.params, seed)
+
+    def _tell(self, trial: Trial, climb: Climb, after: Polished | None) -> FrozenTrial:
+        total = len(self.problem.samples) if self.ladder is not None else 1
+        passes = climb.windows / total if self.ladder is not None else 1.0
+        evaluations, seconds = 1, climb.cpu_seconds
+        if after is not None and not _is_new(after, trial):  # no trial of its own has its cost
+            passes += _passes(after, self.job, self.problem)
+            evaluations += after.evaluations
+            seconds += after.cpu_seconds
+        _note(trial, passes=passes, evaluations=evaluations, cpu_seconds=seconds)
+        if climb.pruned:
+            return self.study.tell(trial, state=TrialState.PRUNED)
+        if math.isfinite(climb.loss):
+            return self.study.tell(trial, climb.loss)
+        return self.study.tell(trial, state=TrialState.FAIL)
+
+    def _add(self, trial: Trial, after: Polished) -> None:
+        assert after.params is not None
+        self.study.add_trial(
+            create_trial(
+                state=TrialState.COMPLETE,
+                value=after.loss,
+                params=dict(after.params),
+                distributions=trial.distributions,
+                user_attrs={
+                    _POLISHED: trial.number,
+                    "passes": _passes(after, self.job, self.problem),
+                    "evaluations": after.evaluations,
+                    "cpu_seconds": after.cpu_seconds,
+                },
+            )
+        )
+
+    def result(self) -> MethodResult:
+        """Return the best trial, evaluated as it would be written to a preset."""
+        job, trials = self.job, self.study.get_trials(deepcopy=False)
+        count = [trial.state for trial in trials].count
+        complete = count(TrialState.COMPLETE)
+        if not complete:
+            raise FitError(f"{job.name}: none of {len(trials)} trials has a finite loss")
+        params = dict(job.fixed) | job.space.rounded(self.study.best_trial.params)
+        return MethodResult(
+            name=job.name,
+            kind="blackbox",
+            params=params,
+            objective=float(self.problem.mean(params)),
+            evaluations=sum(t.user_attrs.get("evaluations", 1) for t in trials),
+            passes=sum(t.user_attrs.get("passes", 1.0) for t in trials),
+            seconds=sum(t.user_attrs.get("seconds", 0.0) for t in trials),
+            cpu_seconds=sum(t.user_attrs.get("cpu_seconds", 0.0) for t in trials),
+            dropped=count(TrialState.FAIL),
+            pruned=count(TrialState.PRUNED),
+            polished=sum(map(_is_polished, trials)),
+            importances=_importances(self.study, complete),
+        )
 
 
-def _run_trial(study: optuna.Study, problem: Problem, job: BlackBoxJob, number: int) -> FrozenTrial:
-    study.sampler = _sampler(job, number)
-    if number < len(job.first):
-        study.enqueue_trial({name: job.first[number][name] for name in job.space.names})
-    with _one_thread(job.method.sampler == "gp"):
-        trial = study.ask()
-        values = {p.name: _suggest(trial, p) for p in job.space.parameters}
-    loss = float(problem.mean(dict(job.fixed) | values))
-    if math.isfinite(loss):
-        return study.tell(trial, loss)
-    return study.tell(trial, state=TrialState.FAIL)
+class _Clock:
+    """Seconds since it was made."""
+
+    def __init__(self) -> None:
+        self._wall, self._cpu = time.monotonic(), time.process_time()
+
+    def wall(self) -> float:
+        return time.monotonic() - self._wall
+
+    def cpu(self) -> float:
+        """Of this process."""
+        return time.process_time() - self._cpu
 
 
-def _suggest(trial: Trial, parameter: FreeParameter) -> Any:
-    name = parameter.name
-    if parameter.choices:
-        return trial.suggest_categorical(name, parameter.choices)
-    low, high = parameter.spec.bounds
-    is_log = parameter.spec.scale == "log"
-    if parameter.is_integer:
-        return trial.suggest_int(name, math.ceil(low), math.floor(high), log=is_log)
-    return trial.suggest_float(name, low, high, log=is_log)
+def _note(trial: Trial, **values: float) -> None:
+    for name, value in values.items():
+        trial.set_user_attr(name, value)
 
 
-def _sampler(job: BlackBoxJob, number: int) -> BaseSampler:
-    seed = seed_of(job.seed, job.index, number) % (1 << 31)
-    kind = job.method.sampler
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", optuna.exceptions.ExperimentalWarning)
-        if kind == "tpe":
-            return TPESampler(seed=seed)
-        if kind == "cmaes":
-            return CmaEsSampler(seed=seed, warn_independent_sampling=False)
-        return GPSampler(seed=seed) if kind == "gp" else RandomSampler(seed=seed)
+def _is_polished(trial: FrozenTrial) -> bool:
+    return _POLISHED in trial.user_attrs
 
 
-def _best(study: optuna.Study) -> float | None:
-    trials = study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,))
-    return min((t.value for t in trials if t.value is not None), default=None)
+def _is_new(after: Polished, trial: Trial) -> bool:
+    return after.params is not None and dict(after.params) != trial.params
+
+
+def _passes(after: Polished, job: BlackBoxJob, problem: Problem) -> float:
+    """Return the cost of polishing in evaluations of all windows."""
+    total, spec = len(problem.samples), job.method.polish
+    batch = total if spec is None or spec.batch is None else min(spec.batch, total)
+    return 1 + (after.evaluations - 1) * batch / total
 
 
 def _log(folder: RunFolder, job: BlackBoxJob, trial: FrozenTrial) -> None:
+    is_pruned = trial.state == TrialState.PRUNED
+    known = ("passes", "cpu_seconds", _POLISHED)
+    extra = {name: trial.user_attrs[name] for name in known if name in trial.user_attrs}
+    if is_pruned:
+        extra["pruned"] = trial.value
     folder.log(
         method=job.index,
         kind="blackbox",
         step=trial.number,
-        loss=[trial.value],
+        loss=[None if is_pruned else trial.value],
         params={name: [value] for name, value in trial.params.items()},
-    )
-
-
-def _result(study: optuna.Study, problem: Problem, job: BlackBoxJob) -> MethodResult:
-    finished = study.get_trials(deepcopy=False)
-    complete = [t for t in finished if t.state == TrialState.COMPLETE]
-    if not complete:
-        raise FitError(f"{job.name}: none of {len(finished)} trials has a finite loss")
-    params = dict(job.fixed) | job.space.rounded(study.best_trial.params)
-    durations = [t.duration.total_seconds() for t in finished if t.duration is not None]
-    return MethodResult(
-        name=job.name,
-        kind="blackbox",
-        params=params,
-        objective=float(problem.mean(params)),
-        evaluations=len(finished),
-        seconds=sum(durations),
-        dropped=len(finished) - len(complete),
-        importances=_importances(study, len(complete)),
+        **extra,
     )
 
 

@@ -14,11 +14,10 @@ from typing import Any
 
 from torchblur.filters import BlurFilter, get_filter
 from torchblur.presets import Preset, save_preset
-from tuning.blackbox import BlackBoxJob, fit_blackbox
 from tuning.cases import AnyCase, SequenceCase
-from tuning.config import GradientMethod, TuneConfig, free_names, resolve
+from tuning.config import TuneConfig, resolve
 from tuning.evaluation import ceiling, score_cases, score_variant, sensitivities
-from tuning.gradient import GradientJob, fit_gradient
+from tuning.methods import run_methods
 from tuning.preparation import fit_device, prepare
 from tuning.problem import Problem
 from tuning.progress import Progress, ProgressEvent, Stage
@@ -94,7 +93,7 @@ def run_fit(
         if finished.is_file() and (folder.path / "report.html").is_file():
             return FitResult.load(finished)
         setting = _prepare(config, folder, progress)
-        methods = _run_methods(setting)
+        methods = run_methods(config, setting.problem, setting.space, folder, progress)
         result, variants = _evaluate(setting, methods, began)
         _write_preset(setting, result)
         folder.write("result.json", result.model_dump_json(indent=2))
@@ -124,32 +123,6 @@ def _prepare(config: TuneConfig, folder: RunFolder, progress: Progress | None) -
         problem=ready.problem,
         notes=ready.notes,
     )
-
-
-def _run_methods(setting: _Setting) -> list[MethodResult]:
-    results: list[MethodResult] = []
-    for index, method in enumerate(setting.config.methods):
-        points: list[dict[str, Any]] = [setting.space.start()]
-        if method.continue_from_best and results:
-            points.append(min(results, key=lambda r: r.objective).params)
-        names = free_names(setting.config, index)
-        fixed = {name: value for name, value in points[-1].items() if name not in names}
-        common: dict[str, Any] = {
-            "index": index,
-            "name": _method_name(setting.config, index),
-            "space": setting.space.subset(names),
-            "fixed": fixed,
-            "first": tuple(points),
-            "seed": setting.config.seed,
-        }
-        if isinstance(method, GradientMethod):
-            gradient = GradientJob(method=method, **common)
-            result = fit_gradient(setting.problem, gradient, setting.folder, setting.progress)
-        else:
-            search = BlackBoxJob(method=method, **common)
-            result = fit_blackbox(setting.problem, search, setting.folder, setting.progress)
-        results.append(result)
-    return results
 
 
 def _evaluate(
@@ -295,13 +268,6 @@ def _write_preset(setting: _Setting, result: FitResult) -> None:
     )
     preset = Preset(filter=result.filter, params=result.params, evidence=evidence)
     save_preset(setting.folder.path / "preset.yaml", preset, comment=comment, overwrite=True)
-
-
-def _method_name(config: TuneConfig, index: int) -> str:
-    """Return a short name, unique in the run: "gradient", "tpe", "tpe 2"."""
-    labels = [m.sampler if m.kind == "blackbox" else "gradient" for m in config.methods]
-    repeat = labels[: index + 1].count(labels[index])
-    return labels[index] if repeat == 1 else f"{labels[index]} {repeat}"
 
 
 def _versions() -> dict[str, str]:

@@ -92,7 +92,10 @@ def fit_gradient(
     stage = Stage(job.name, job.method.steps, progress, done=state.step)
     began = time.monotonic() - state.seconds
     while state.step < job.method.steps:
+        cpu = time.process_time()
         record = state.advance(problem)
+        record["cpu_seconds"] = time.process_time() - cpu
+        state.cpu_seconds += record["cpu_seconds"]
         state.seconds = time.monotonic() - began
         if folder is not None:
             folder.log(method=job.index, kind="gradient", **record)
@@ -123,9 +126,10 @@ class _State:
         self.best_unit = self.first.clone()
         self.step = 0
         self.seconds = 0.0
+        self.cpu_seconds = 0.0
 
     def dump(self) -> dict[str, Any]:
-        names = ("first", "alive", "best_loss", "best_unit", "step", "seconds")
+        names = ("first", "alive", "best_loss", "best_unit", "step", "seconds", "cpu_seconds")
         state = {name: getattr(self, name) for name in names}
         return state | {"unit": self.unit.detach(), "optimizer": self.optimizer.state_dict()}
 
@@ -244,10 +248,16 @@ def _result(problem: Problem, job: GradientJob, state: _State) -> MethodResult:
         params=dict(job.fixed) | starts[best].params,
         objective=objective,
         evaluations=state.step * len(starts),
+        passes=state.step * len(starts) * _share(job.method.batch, len(problem.samples)),
         seconds=state.seconds,
+        cpu_seconds=state.cpu_seconds,
         starts=tuple(starts),
         dropped=int((~state.alive).sum()),
     )
+
+
+def _share(batch: int | None, total: int) -> float:
+    return 1.0 if batch is None else min(batch, total) / total
 
 
 def _scalars(space: Space, point: Tensor) -> dict[str, float]:

@@ -46,6 +46,12 @@ class Problem:
         self._single: dict[int, AnyGroup] = {}
         self._joined: list[tuple[list[int], AnyGroup]] | None = None
 
+    @property
+    def sets_per_call(self) -> int:
+        """How many parameter sets go into one call."""
+        largest = max(s.size[0] * s.size[1] for s in self.samples)
+        return max(1, _budget(self.samples[0]) // largest)
+
     def losses(
         self,
         values: Mapping[str, Any],
@@ -114,8 +120,7 @@ class Problem:
             values: (K,) tensors, or for K = 1 any single values, by name.
             count: K.
         """
-        largest = max(s.size[0] * s.size[1] for s in self.samples)
-        most = max(1, _budget(self.samples[0]) // largest)
+        most = self.sets_per_call
         means = []
         for first in range(0, count, most):
             some = {n: _rows(value, first, most) for n, value in values.items()}

@@ -34,11 +34,19 @@ class MethodResult(Config):
     objective: float
     """On all training frames or windows; the choice between methods goes by it."""
     evaluations: int
-    """Parameter sets evaluated."""
+    """Parameter sets evaluated, with or without gradient."""
+    passes: float = 0.0
+    """The same in passes over all windows: a pruned trial counts for those that it saw."""
     seconds: float
+    cpu_seconds: float = 0.0
+    """Of the process, all threads."""
     starts: tuple[StartResult, ...] = ()
     dropped: int = 0
     """Starts or trials with a loss that was not finite."""
+    pruned: int = 0
+    """Trials that were stopped before they saw all windows."""
+    polished: int = 0
+    """Trials that gradient steps found."""
     importances: dict[str, float] = Field(default_factory=dict)
     """Share of each parameter in the spread of the objective, as Optuna estimates it."""
 

@@ -1,0 +1,181 @@
+"""What a fit is told of its methods: gradient steps, searches, and searches with more to them."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping
+from typing import Annotated, Literal
+
+from pydantic import Field
+
+from torchblur.errors import ConfigError, nearest_name
+from torchblur.params import Config, Param
+
+__all__ = [
+    "BlackBoxMethod",
+    "GradientMethod",
+    "Method",
+    "PolishSpec",
+    "PruningSpec",
+    "check_method",
+    "polished_names",
+]
+
+
+class _MethodBase(Config):
+    free: tuple[str, ...] | None = Field(
+        None, min_length=1, description="the free parameters that this method fits; all if left out"
+    )
+    continue_from_best: bool = Field(
+        False, description="begin at the best of the methods before it, beside the start values"
+    )
+
+
+class _Windows(Config):
+    batch: int | None = Field(
+        None, ge=1, description="frames or windows of a step, drawn anew; all if left out"
+    )
+    unroll: int | None = Field(
+        None,
+        ge=1,
+        description="frames of a sequence that gradients go back through at most (truncated "
+        "backpropagation: memory for so many); all if left out",
+    )
+
+
+class GradientMethod(_MethodBase, _Windows):
+    """Adam in the unit cube, from several starts at once; for smooth parameters."""
+
+    kind: Literal["gradient"]
+    steps: int = Field(100, ge=1, description="steps of the optimizer")
+    starts: int = Field(4, ge=1, description="the first at the start values, the others random")
+    learning_rate: float = Field(
+        0.03, gt=0, le=1, description="first step, as a fraction of each range; falls by a cosine"
+    )
+
+
+class PolishSpec(_Windows):
+    """Gradient steps from the promising trials of a search; what they find joins the study."""
+
+    steps: int = Field(15, ge=1, description="steps of Adam from one trial")
+    learning_rate: float = Field(
+        0.03, gt=0, le=1, description="first step, as a fraction of each range; falls by a cosine"
+    )
+    quantile: float = Field(
+        0.25, gt=0, le=1, description="a trial is polished if it is in this best share so far"
+    )
+    free: tuple[str, ...] | None = Field(
+        None, min_length=1, description="what is polished; the method's smooth ones if left out"
+    )
+
+
+class PruningSpec(Config):
+    """Trials begin on a few windows, and only the promising ones see more."""
+
+    pruner: Literal["sha", "hyperband", "median"] = Field(
+        "sha",
+        description="successive halving, several of them that begin later and later, or: stop "
+        "what is worse than the median",
+    )
+    first: float = Field(0.25, gt=0, lt=1, description="share of the windows that all trials see")
+    factor: int = Field(
+        2,
+        ge=2,
+        description="each rung has so many times the windows of the one before; with sha and "
+        "hyperband one trial in so many goes on",
+    )
+    startup: int = Field(5, ge=1, description="so many trials at the beginning see all windows")
+
+
+class BlackBoxMethod(_MethodBase):
+    """An Optuna sampler; for parameters of every class."""
+
+    kind: Literal["blackbox"]
+    sampler: Literal["tpe", "cmaes", "gp", "random"] = Field("tpe", description="Optuna's sampler")
+    trials: int = Field(100, ge=1, description="candidates; the first at the start values")
+    population: int = Field(
+        1,
+        ge=1,
+        description="candidates drawn together, before any of them is known, and filtered in one "
+        "call if their discrete values agree; of cmaes the generation",
+    )
+    polish: PolishSpec | None = Field(None, description="gradient steps from promising trials")
+    pruning: PruningSpec | None = Field(None, description="few windows first")
+
+
+Method = Annotated[GradientMethod | BlackBoxMethod, Field(discriminator="kind")]
+
+
+def polished_names(
+    method: BlackBoxMethod, names: Collection[str], specs: Mapping[str, Param]
+) -> tuple[str, ...]:
+    """Return what a search polishes by gradient, in the order of the free parameters.
+
+    Args:
+        method: The search.
+        names: What it fits.
+        specs: Declarations of the filter's parameters.
+    """
+    if method.polish is None:
+        return ()
+    if method.polish.free is not None:
+        return tuple(name for name in names if name in method.polish.free)
+    return tuple(name for name in names if specs[name].grad == "smooth")
+
+
+def check_method(
+    method: GradientMethod | BlackBoxMethod,
+    names: Collection[str],
+    specs: Mapping[str, Param],
+    place: str,
+) -> None:
+    """Refuse a method that cannot fit what it is given.
+
+    Args:
+        method: The method.
+        names: What it fits.
+        specs: Declarations of the filter's parameters.
+        place: Key path of the method, with the file, for messages.
+
+    Raises:
+        ConfigError: a parameter without a usable gradient; nothing to polish; a sampler that
+            cannot learn from what is polished.
+    """
+    if isinstance(method, GradientMethod):
+        for name in names:
+            _check_gradient(name, specs[name], bool(method.free), place)
+    elif method.polish is not None:
+        _check_polish(method, names, specs, place)
+
+
+def _check_gradient(name: str, spec: Param, is_named: bool, place: str) -> None:
+    if spec.grad == "discrete" or (spec.grad == "weak" and not is_named):
+        raise ConfigError(
+            f"`{name}` is {spec.grad} and has no usable gradient; fit it with a `blackbox` method, "
+            f"and name this method's own parameters in its `free` ({place}.free)"
+        )
+
+
+def _check_polish(
+    method: BlackBoxMethod, names: Collection[str], specs: Mapping[str, Param], place: str
+) -> None:
+    assert method.polish is not None
+    if method.sampler == "cmaes":
+        raise ConfigError(
+            "`polish` needs a sampler that learns from points which it did not draw: tpe, gp or "
+            f"random, got cmaes ({place}.polish)"
+        )
+    for name in method.polish.free or ():
+        if name not in names:
+            raise ConfigError(
+                f"`{name}` is not among the parameters of the search{nearest_name(name, names)} "
+                f"({place}.polish.free)"
+            )
+        if specs[name].grad == "discrete":
+            raise ConfigError(
+                f"`{name}` is discrete and cannot be polished by its gradient ({place}.polish.free)"
+            )
+    if not polished_names(method, names, specs):
+        raise ConfigError(
+            f"`polish` needs a smooth parameter, and the search has {', '.join(names)} "
+            f"({place}.polish)"
+        )

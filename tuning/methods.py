@@ -1,0 +1,80 @@
+"""The methods of a fit, in their order: each may begin at the best of those before it."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from torchblur.filters import get_filter
+from torchblur.params import declared
+from tuning.blackbox import BlackBoxJob, fit_blackbox
+from tuning.config import TuneConfig, free_names
+from tuning.gradient import GradientJob, fit_gradient
+from tuning.method_config import GradientMethod, polished_names
+from tuning.problem import Problem
+from tuning.progress import Progress
+from tuning.result import MethodResult
+from tuning.runfolder import RunFolder
+from tuning.space import Space
+
+__all__ = ["method_name", "run_methods"]
+
+
+def run_methods(
+    config: TuneConfig,
+    problem: Problem,
+    space: Space,
+    folder: RunFolder | None = None,
+    progress: Progress | None = None,
+) -> list[MethodResult]:
+    """Run all methods of a configuration.
+
+    Args:
+        config: A resolved configuration.
+        problem: The objective on the training frames.
+        space: All free parameters.
+        folder: Where logs, checkpoints and journals go, and what is gone on from.
+        progress: Who is told of each step.
+
+    Returns:
+        What each of them found.
+
+    Raises:
+        FitError: a method has no parameter set with a finite loss.
+        ConfigError: too few windows for the rungs of a pruner.
+    """
+    results: list[MethodResult] = []
+    for index, method in enumerate(config.methods):
+        points: list[dict[str, Any]] = [space.start()]
+        if method.continue_from_best and results:
+            points.append(min(results, key=lambda r: r.objective).params)
+        names = free_names(config, index)
+        common: dict[str, Any] = {
+            "index": index,
+            "name": method_name(config, index),
+            "space": space.subset(names),
+            "fixed": {name: value for name, value in points[-1].items() if name not in names},
+            "first": tuple(points),
+            "seed": config.seed,
+        }
+        if isinstance(method, GradientMethod):
+            gradient = GradientJob(method=method, **common)
+            result = fit_gradient(problem, gradient, folder, progress)
+        else:
+            specs = declared(get_filter(config.filter.kind).config_class)
+            polished = polished_names(method, names, specs)
+            search = BlackBoxJob(method=method, polished=polished, **common)
+            result = fit_blackbox(problem, search, folder, progress)
+        results.append(result)
+    return results
+
+
+def method_name(config: TuneConfig, index: int) -> str:
+    """Return a short name, unique in the run: "gradient", "tpe", "tpe 2".
+
+    Args:
+        config: The configuration.
+        index: Position among its methods.
+    """
+    labels = [m.sampler if m.kind == "blackbox" else "gradient" for m in config.methods]
+    repeat = labels[: index + 1].count(labels[index])
+    return labels[index] if repeat == 1 else f"{labels[index]} {repeat}"
