@@ -1,5 +1,6 @@
 """Scenes that move: sharp G-buffers, stochastic streams, and exact motion-blurred references."""
 
+from torchblur.render.family import SceneFamily, draw_scene, load_family
 from torchblur.render.renderer import (
     Reference,
     Renderer,
@@ -15,6 +16,9 @@ __all__ = [
     "Renderer",
     "Revealed",
     "Scene",
+    "SceneFamily",
+    "draw_scene",
+    "load_family",
     "load_scene",
     "render_frame",
     "render_reference",

@@ -21,7 +21,7 @@ from torchblur.render.mesh_body import Mesh
 from torchblur.render.motion import Level, Number, Placed, Triple
 from torchblur.render.textures import SolidTexture, Texture
 
-__all__ = ["Group", "Light", "Scene", "load_scene"]
+__all__ = ["Group", "Light", "Scene", "load_scene", "read_mapping"]
 
 
 class Light(Config):
@@ -109,19 +109,28 @@ def load_scene(path: str | os.PathLike[str]) -> Scene:
         ConfigError: the file cannot be read, is not YAML, or does not describe a scene; with the
             file, the place in it, the rule and the value.
     """
-    try:
-        data = YAML(typ="safe", pure=True).load(Path(path).read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError) as error:
-        raise ConfigError(f"the scene {os.fspath(path)} cannot be read: {error}") from error
-    except YAMLError as error:
-        raise ConfigError(f"{os.fspath(path)} is not valid YAML: {error}") from error
-    if not isinstance(data, dict):
-        raise ConfigError(
-            f"a scene must be a mapping with `camera` and `bodies`, got {type(data).__name__} "
-            f"({os.fspath(path)})"
-        )
+    data = read_mapping(Path(path), "scene", "`camera` and `bodies`")
     folder = Path(path).absolute().parent
     return build(Scene, _with_paths(data, lambda name: str(folder / name)), os.fspath(path))
+
+
+def read_mapping(path: Path, kind: str, keys: str) -> dict[Any, Any]:
+    """Return the mapping that a YAML file holds; `kind` and `keys` are for the message.
+
+    Raises:
+        ConfigError: the file cannot be read, is not YAML, or holds something else.
+    """
+    try:
+        data = YAML(typ="safe", pure=True).load(path.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError) as error:
+        raise ConfigError(f"the {kind} {path} cannot be read: {error}") from error
+    except YAMLError as error:
+        raise ConfigError(f"{path} is not valid YAML: {error}") from error
+    if not isinstance(data, dict):
+        raise ConfigError(
+            f"a {kind} must be a mapping with {keys}, got {type(data).__name__} ({path})"
+        )
+    return data
 
 
 def _with_paths(data: Any, change: Callable[[str], str]) -> Any:
