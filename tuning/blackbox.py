@@ -14,6 +14,7 @@ import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import optuna
@@ -25,7 +26,7 @@ from tuning.candidates import evaluate_candidates
 from tuning.fidelity import Climb, Ladder
 from tuning.gradient import FitError, seed_of
 from tuning.method_config import BlackBoxMethod
-from tuning.polish import Polished, is_promising, polish
+from tuning.polish import Polished, PolishStart, is_promising, polish
 from tuning.problem import Problem
 from tuning.progress import Progress, Stage
 from tuning.result import MethodResult
@@ -135,14 +136,7 @@ class _Search:
         trials = [self._ask(number) for number in range(self.drawn, self._end_of_round())]
         drawing = began.cpu() / len(trials)
         found = self._evaluate(trials)
-        losses = self._known_losses()
-        polished = []
-        for trial, climb in zip(trials, found, strict=True):
-            if not climb.pruned and math.isfinite(climb.loss):
-                polished.append(self._polish(trial, climb.loss, losses))
-                losses.append(climb.loss)
-            else:
-                polished.append(None)
+        polished = self._polish(trials, found)
         for trial, climb in zip(trials, found, strict=True):
             climb.cpu_seconds += drawing
             trial.set_user_attr("seconds", began.wall() / len(trials))
@@ -172,25 +166,35 @@ class _Search:
 
     def _evaluate(self, trials: Sequence[Trial]) -> list[Climb]:
         candidates = [trial.params for trial in trials]
-        space, fixed = self.job.space, self.job.fixed
+        space, fixed, together = self.job.space, self.job.fixed, self.job.method.together
         if self.ladder is not None:
-            return self.ladder.climb(trials, space, fixed, candidates)
-        return [
-            Climb(loss=float(one.losses), cpu_seconds=one.cpu_seconds)
-            for one in evaluate_candidates(self.problem, space, fixed, candidates)
-        ]
+            return self.ladder.climb(trials, space, fixed, candidates, together)
+        found = evaluate_candidates(self.problem, space, fixed, candidates, together=together)
+        return [Climb(loss=float(one.losses), cpu_seconds=one.cpu_seconds) for one in found]
 
     def _known_losses(self) -> list[float]:
         trials = self.study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,))
         return [t.value for t in trials if t.value is not None and not _is_polished(t)]
 
-    def _polish(self, trial: Trial, loss: float, before: Sequence[float]) -> Polished | None:
+    def _polish(
+        self, trials: Sequence[Trial], climbs: Sequence[Climb]
+    ) -> Sequence[Polished | None]:
+        """Return what the steps found from each promising trial, and None for the others."""
         job, spec = self.job, self.job.method.polish
-        if spec is None or not is_promising(loss, before, spec.quantile):
-            return None
-        seed = seed_of(job.seed, job.index, trial.number, _POLISH_SEED)
-        space = job.space.subset(job.polished)
-        return polish(self.problem, spec, space, job.fixed, trial.params, seed)
+        if spec is None:
+            return [None] * len(trials)
+        losses, points = self._known_losses(), {}
+        for trial, climb in zip(trials, climbs, strict=True):
+            if climb.pruned or not math.isfinite(climb.loss):
+                continue
+            if is_promising(climb.loss, losses, spec.quantile):
+                seed = seed_of(job.seed, job.index, trial.number, _POLISH_SEED)
+                points[trial.number] = PolishStart(trial.params, seed)
+            losses.append(climb.loss)
+        steps = partial(polish, spec, job.space.subset(job.polished), job.fixed)
+        found = self.problem.map(steps, list(points.values()))
+        by_number = dict(zip(points, found, strict=True))
+        return [by_number.get(trial.number) for trial in trials]
 
     def _tell(self, trial: Trial, climb: Climb, after: Polished | None) -> FrozenTrial:
         total = len(self.problem.samples) if self.ladder is not None else 1

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import torch
@@ -31,6 +32,14 @@ class Evaluated:
     cpu_seconds: float
 
 
+@dataclass(frozen=True, eq=False)
+class _Batch:
+    """Candidates of one call: `count` sets, each value one for all or (count,)."""
+
+    values: Mapping[str, Any]
+    count: int
+
+
 def evaluate_candidates(
     problem: Problem,
     space: Space,
@@ -38,31 +47,39 @@ def evaluate_candidates(
     candidates: Sequence[Mapping[str, Any]],
     *,
     by_window: bool = False,
+    together: int | None = None,
 ) -> list[Evaluated]:
     """Return the objective of candidates, in their order.
 
-    How many of a batch go into one call is a matter of memory and changes no figure.
+    What is filtered together depends on the candidates and on `together` alone, never on who does
+    it: so the figures of a cluster are those of one process.
 
     Args:
-        problem: The objective.
+        problem: The objective; calls go to the workers of its cluster, if it has one.
         space: The parameters that the candidates have.
         fixed: Values of all others.
-        candidates: A value for each parameter. Those that differ in floats alone are one batch.
+        candidates: A value for each parameter. Those that differ in floats alone may be one batch.
         by_window: Return the objective of each window.
+        together: So many candidates go into one call. Left out: one on the CPU, where more of them
+            are no faster; on a GPU as many as fit.
     """
-    found: dict[int, Evaluated] = {}
+    on_cpu = problem.samples[0].device.type == "cpu"
+    most = together or (1 if on_cpu else problem.sets_per_call)
+    places, batches = [], []
     for key, positions in _alike(space, candidates).items():
-        began = time.process_time()
-        if len(positions) == 1:
-            values = dict(fixed) | dict(candidates[positions[0]])
-            losses = problem.each(values)[:, 0] if by_window else problem.mean(values)
-            columns = [losses]
-        else:
-            values = dict(fixed) | dict(key) | _columns(space, candidates, positions)
-            each = _each(problem, values, len(positions))
-            columns = list((each if by_window else reduced(each, problem.objective)[None]).T)
-        share = (time.process_time() - began) / len(positions)
-        found |= {i: Evaluated(c, share) for i, c in zip(positions, columns, strict=True)}
+        for first in range(0, len(positions), most):
+            some = positions[first : first + most]
+            values = dict(fixed) | dict(key)
+            if len(some) == 1:
+                values |= candidates[some[0]]
+            else:
+                values |= _columns(space, candidates, some)
+            places.append(some)
+            batches.append(_Batch(values, len(some)))
+    found: dict[int, Evaluated] = {}
+    losses = problem.map(partial(_evaluated, by_window), batches)
+    for some, evaluated in zip(places, losses, strict=True):
+        found |= zip(some, evaluated, strict=True)
     return [found[index] for index in range(len(candidates))]
 
 
@@ -85,17 +102,17 @@ def _columns(
     }
 
 
-def _each(problem: Problem, values: Mapping[str, Any], count: int) -> Tensor:
-    """Return the objective of each window for a batch, (n, K), window after window."""
-    most, everything = problem.sets_per_call, range(len(problem.samples))
-    parts = []
-    for first in range(0, count, most):
-        some = {
-            n: v[first : first + most] if isinstance(v, Tensor) and v.ndim == 1 else v
-            for n, v in values.items()
-        }
-        parts.append(problem.each(some, min(most, count - first), everything))
-    return torch.cat(parts, dim=1)
+def _evaluated(by_window: bool, problem: Problem, batch: _Batch) -> list[Evaluated]:
+    """Return the objective of one batch."""
+    began = time.process_time()
+    if batch.count == 1:
+        columns = [problem.each(batch.values)[:, 0] if by_window else problem.mean(batch.values)]
+    else:
+        everything = range(len(problem.samples))
+        each = problem.each(batch.values, batch.count, everything)
+        columns = list((each if by_window else reduced(each, problem.objective)[None]).T)
+    share = (time.process_time() - began) / batch.count
+    return [Evaluated(losses.clone(), share) for losses in columns]
 
 
 def _alike(

@@ -92,12 +92,7 @@ class Ladder:
         self.order = tuple(torch.randperm(total, generator=generator).tolist())
         firsts = (0, *self.sizes[:-1])
         self._parts = [
-            Problem(
-                problem.blur,
-                [problem.samples[i] for i in self.order[first:end]],
-                problem.objective,
-                problem.free,
-            )
+            problem.subset(self.order[first:end])
             for first, end in zip(firsts, self.sizes, strict=True)
         ]
 
@@ -107,6 +102,7 @@ class Ladder:
         space: Space,
         fixed: Mapping[str, Any],
         candidates: Sequence[Mapping[str, Any]],
+        together: int | None = None,
     ) -> list[Climb]:
         """Evaluate trials that were drawn together, rung by rung.
 
@@ -117,12 +113,15 @@ class Ladder:
             space: What they were drawn from.
             fixed: Values of the other parameters.
             candidates: Values of each trial.
+            together: As `evaluate_candidates` takes it.
         """
         climbs = [Climb() for _ in trials]
         left = list(range(len(trials)))
         for rung, part in enumerate(self._parts):
             asked = [candidates[i] for i in left]
-            found = evaluate_candidates(part, space, fixed, asked, by_window=True)
+            found = evaluate_candidates(
+                part, space, fixed, asked, by_window=True, together=together
+            )
             for index, one in zip(left, found, strict=True):
                 climbs[index].add(one, part.objective)
             left = [i for i in left if math.isfinite(climbs[i].loss)]

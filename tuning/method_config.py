@@ -95,8 +95,14 @@ class BlackBoxMethod(_MethodBase):
     population: int = Field(
         1,
         ge=1,
-        description="candidates drawn together, before any of them is known, and filtered in one "
-        "call if their discrete values agree; of cmaes the generation",
+        description="candidates drawn together, before any of them is known: what the workers of "
+        "a cluster share; of cmaes the generation",
+    )
+    together: int | None = Field(
+        None,
+        ge=1,
+        description="candidates of a population that are filtered in one call if their discrete "
+        "values agree; left out: one on the CPU, as many as fit on a GPU",
     )
     polish: PolishSpec | None = Field(None, description="gradient steps from promising trials")
     pruning: PruningSpec | None = Field(None, description="few windows first")

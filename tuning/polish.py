@@ -18,7 +18,7 @@ from tuning.method_config import GradientMethod, PolishSpec
 from tuning.problem import Problem
 from tuning.space import Space
 
-__all__ = ["Polished", "is_promising", "polish"]
+__all__ = ["PolishStart", "Polished", "is_promising", "polish"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -38,6 +38,19 @@ class Polished:
     cpu_seconds: float
 
 
+@dataclass(frozen=True)
+class PolishStart:
+    """Where steps begin.
+
+    Args:
+        params: Values of the trial.
+        seed: Of the windows of each step.
+    """
+
+    params: Mapping[str, Any]
+    seed: int
+
+
 def is_promising(loss: float, before: Sequence[float], quantile: float) -> bool:
     """Return whether a loss is among the best share of the losses so far.
 
@@ -51,23 +64,18 @@ def is_promising(loss: float, before: Sequence[float], quantile: float) -> bool:
 
 
 def polish(
-    problem: Problem,
-    spec: PolishSpec,
-    space: Space,
-    fixed: Mapping[str, Any],
-    params: Mapping[str, Any],
-    seed: int,
+    spec: PolishSpec, space: Space, fixed: Mapping[str, Any], problem: Problem, start: PolishStart
 ) -> Polished:
     """Go down the gradient from a trial.
 
     Args:
-        problem: The objective.
         spec: Number and size of the steps.
         space: The parameters that are polished.
         fixed: Values of the free parameters that the search does not have.
-        params: Values of the trial.
-        seed: Of the windows of each step.
+        problem: The objective.
+        start: Where it begins.
     """
+    params = start.params
     method = GradientMethod(
         kind="gradient",
         steps=spec.steps,
@@ -78,7 +86,13 @@ def polish(
     )
     others = {n: v for n, v in (dict(fixed) | dict(params)).items() if n not in space.names}
     job = GradientJob(
-        method=method, index=0, name="polish", space=space, fixed=others, first=(params,), seed=seed
+        method=method,
+        index=0,
+        name="polish",
+        space=space,
+        fixed=others,
+        first=(params,),
+        seed=start.seed,
     )
     began = time.process_time()
     found: Mapping[str, Any] | None = None

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from typing import Any
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Any, TypeVar
 
 import torch
 from torch import Tensor
@@ -15,6 +15,9 @@ from tuning.reduction import tail_weights
 from tuning.windows import AnySample
 
 __all__ = ["Problem"]
+
+T = TypeVar("T")
+R = TypeVar("R")
 
 _PIXELS_PER_BATCH = {"cpu": 1 << 18, "cuda": 1 << 23}
 
@@ -51,6 +54,25 @@ class Problem:
         """How many parameter sets go into one call."""
         largest = max(s.size[0] * s.size[1] for s in self.samples)
         return max(1, _budget(self.samples[0]) // largest)
+
+    def subset(self, chosen: Sequence[int]) -> Problem:
+        """Return the objective of some of the windows.
+
+        Args:
+            chosen: Their positions.
+        """
+        return Problem(self.blur, [self.samples[i] for i in chosen], self.objective, self.free)
+
+    def map(self, function: Callable[[Problem, T], R], items: Sequence[T]) -> list[R]:
+        """Return `function(problem, item)` for items that do not depend on each other, in order.
+
+        Here one is done after the other; the workers of a cluster do as many as they are at a time.
+
+        Args:
+            function: A function of a module, or a `functools.partial` of one.
+            items: Plain values and tensors.
+        """
+        return [function(self, item) for item in items]
 
     def losses(
         self,
