@@ -15,20 +15,10 @@ from torch import Tensor
 
 import torchblur.render
 from torchblur.frame import Frame
+from torchblur.ops.compiling import cache_folder
 from torchblur.render import load_scene
 
 __all__ = ["cache_folder", "cache_key", "cached", "frame_of", "hash_scene", "planes_of"]
-
-
-def cache_folder() -> Path:
-    """Return where rendered frames are kept.
-
-    TORCHBLUR_CACHE, or `torchblur` in XDG_CACHE_HOME, or `~/.cache/torchblur`.
-    """
-    if own := os.environ.get("TORCHBLUR_CACHE"):
-        return Path(own)
-    base = os.environ.get("XDG_CACHE_HOME")
-    return (Path(base) if base else Path.home() / ".cache") / "torchblur"
 
 
 def cached(key: str, make: Callable[[], dict[str, Tensor]]) -> dict[str, Tensor]:
@@ -95,9 +85,13 @@ def frame_of(tensors: Mapping[str, Tensor], prefix: str, source: str) -> Frame:
 
 
 def _renderer_hash() -> str:
-    """Return the hash of the renderer's source: another renderer, another image."""
+    """Return the hash of the renderer's source: another renderer, another image.
+
+    Families are left out: what they draw is a scene, which has a hash of its own.
+    """
     digest = hashlib.sha256()
     for folder in torchblur.render.__path__:
         for file in sorted(Path(folder).glob("*.py")):
-            digest.update(file.read_bytes())
+            if not file.name.startswith("family"):
+                digest.update(file.read_bytes())
     return digest.hexdigest()

@@ -222,7 +222,7 @@ def broken_compiler(monkeypatch):
         raise BackendCompilerFailed(function, RuntimeError("no C++ compiler"), None)
 
     monkeypatch.setattr(torch, "compile", compile_)
-    monkeypatch.setattr("torchblur.render.compiling._state", {"works": True})
+    monkeypatch.setattr("torchblur.ops.compiling._state", {"works": True, "looked": True})
     monkeypatch.setattr("torchblur.render.compiling._compiled", lambda f: torch.compile(f))
 
 

@@ -1,17 +1,66 @@
-"""What is needed to compile with `torch.compile`, and to go on where there is no compiler."""
+"""What is needed to compile with `torch.compile`, and to go on where there is no compiler.
+
+Compiled kernels are kept on disk, so that only the first process of all compiles them: see
+`kernel_folder`.
+"""
 
 from __future__ import annotations
 
 import functools
 import importlib
+import itertools
+import os
+import threading
 import warnings
+from collections.abc import Callable
+from pathlib import Path
+from types import FunctionType
+from typing import Any
 
-__all__ = ["compiler_errors", "load_compiler", "warn_no_compiler"]
+import torch
+
+__all__ = [
+    "cache_folder",
+    "compile_alone",
+    "compiler_errors",
+    "compiler_works",
+    "give_up_compiling",
+    "kernel_folder",
+    "load_compiler",
+]
+
+_CACHE_VARIABLE = "TORCHINDUCTOR_CACHE_DIR"
+
+_numbers = itertools.count()
+_lock = threading.Lock()
+_state = {"works": True, "looked": False}
+
+
+def cache_folder() -> Path:
+    """Return where torchblur keeps what costs time to make.
+
+    TORCHBLUR_CACHE, or `torchblur` in XDG_CACHE_HOME, or `~/.cache/torchblur`.
+    """
+    if own := os.environ.get("TORCHBLUR_CACHE"):
+        return Path(own)
+    base = os.environ.get("XDG_CACHE_HOME")
+    return (Path(base) if base else Path.home() / ".cache") / "torchblur"
+
+
+def kernel_folder() -> Path:
+    """Return where compiled kernels are kept.
+
+    TORCHINDUCTOR_CACHE_DIR if it is set (torch sets it as soon as anything is compiled), else
+    `kernels` in `cache_folder`.
+    """
+    own = os.environ.get(_CACHE_VARIABLE)
+    return Path(own) if own else cache_folder() / "kernels"
 
 
 @functools.cache
 def load_compiler() -> None:
-    """Load torch's compiler without the warnings that it gives of itself."""
+    """Load torch's compiler without the warnings that it gives of itself; set its cache."""
+    _keep_kernels()
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DeprecationWarning)
         importlib.import_module("torch._inductor.compile_fx")
@@ -25,14 +74,84 @@ def compiler_errors() -> tuple[type[Exception], ...]:
     return BackendCompilerFailed, InductorError
 
 
-@functools.cache
-def warn_no_compiler(reason: str) -> None:
-    """Warn, once per reason and process, that code runs without the compiler.
+def compiler_works() -> bool:
+    """Return whether it makes sense to compile; if not, there was one notice in this process.
+
+    False where there is no C++ compiler, and after `give_up_compiling`.
+    """
+    with _lock:
+        if not _state["looked"]:
+            _state["looked"] = True
+            reason = _missing_compiler()
+            if reason is not None:
+                _stop(reason)
+        return _state["works"]
+
+
+def give_up_compiling(error: Exception) -> None:
+    """Compile nothing more in this process, with one notice; from any thread.
 
     Args:
-        reason: First line of the compiler's error.
+        error: What torch.compile raised.
     """
+    with _lock:
+        if _state["works"]:
+            _stop((str(error).splitlines() or [type(error).__name__])[0])
+
+
+def compile_alone(function: Callable[..., Any], **options: Any) -> Callable[..., Any]:
+    """Return a function compiled by `torch.compile`, with a count of compilations of its own.
+
+    Torch counts compilations per code object and after a few compiles no more, without an error;
+    all functions that one line of code makes share theirs. Each gets a copy here.
+
+    Args:
+        function: What is compiled.
+        **options: Of `torch.compile`.
+    """
+    load_compiler()
+    name = f"{function.__name__}_{next(_numbers)}"
+    own = FunctionType(
+        function.__code__.replace(co_name=name),
+        function.__globals__,
+        name,
+        function.__defaults__,
+        function.__closure__,
+    )
+    return torch.compile(own, **options)  # type: ignore[no-any-return]
+
+
+def _keep_kernels() -> None:
+    """Tell torch where kernels are kept, if the user did not; its default is a temporary folder."""
+    if os.environ.get(_CACHE_VARIABLE):
+        return
+    folder = kernel_folder()
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError:
+        return
+    if os.access(folder, os.W_OK):
+        os.environ[_CACHE_VARIABLE] = str(folder)
+
+
+def _missing_compiler() -> str | None:
+    """Return why the CPU's kernels cannot be compiled, or None; a GPU has a compiler of its own."""
+    if torch.cuda.is_available():
+        return None
+    load_compiler()
+    find = importlib.import_module("torch._inductor.cpp_builder").get_cpp_compiler
+    try:
+        find()
+    except Exception:  # of several kinds, by platform
+        return "no C++ compiler"
+    return None
+
+
+def _stop(reason: str) -> None:
+    _state["works"] = False
     warnings.warn(
-        f"torch.compile does not work here ({reason}); going on without it, which is slower",
-        stacklevel=3,
+        f"torch.compile does not work here ({reason}); going on without it, which is 2 to 5 times "
+        "slower. Install a C++ compiler (g++, clang++) or name one in CXX; `engine: eager` "
+        "(--no-compile) goes without it and without this notice",
+        stacklevel=4,
     )

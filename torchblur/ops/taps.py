@@ -17,7 +17,12 @@ import torch
 from torch import Tensor
 
 from torchblur.errors import ConfigError
-from torchblur.ops.compiling import compiler_errors, load_compiler, warn_no_compiler
+from torchblur.ops.compiling import (
+    compile_alone,
+    compiler_errors,
+    compiler_works,
+    give_up_compiling,
+)
 
 __all__ = ["Added", "Engine", "Inputs", "Planes", "TapFunction", "sum_taps"]
 
@@ -68,7 +73,7 @@ def sum_taps(
     signature = tuple((name, t.shape, t.dtype) for name, t in given.items())
     form = _form_of(tap, options, signature, num_maxima)
     # The compiler makes special cases of 0 and 1; so few pixels gain nothing by it.
-    if any(0 in shape for shape in form.shapes):
+    if any(0 in shape for shape in form.shapes) or not (engine == "eager" or compiler_works()):
         engine = "eager"
     for candidate in ("compiled", "eager") if engine == "compiled" else ("eager",):
         kernel = _kernel(tap, options, candidate, form.num_summed)
@@ -77,7 +82,7 @@ def sum_taps(
         except compiler_errors() as error:
             if candidate == "eager":
                 raise
-            warn_no_compiler((str(error).splitlines() or [type(error).__name__])[0])
+            give_up_compiling(error)
     raise AssertionError("unreachable")
 
 
@@ -247,6 +252,5 @@ def _kernel(tap: TapFunction, options: Hashable, engine: Engine, num_summed: int
         return {name: totals[name] + parts[name] for name in totals}, taken
 
     if engine == "compiled":
-        load_compiler()
-        return _Kernel(torch.compile(add, dynamic=True), torch.compile(pull, dynamic=True))
+        return _Kernel(compile_alone(add, dynamic=True), compile_alone(pull, dynamic=True))
     return _Kernel(add, pull)

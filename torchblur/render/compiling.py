@@ -4,19 +4,19 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable
-from types import FunctionType
 from typing import Any, Literal
 
-import torch
-
 from torchblur.errors import ConfigError
-from torchblur.ops.compiling import compiler_errors, load_compiler, warn_no_compiler
+from torchblur.ops.compiling import (
+    compile_alone,
+    compiler_errors,
+    compiler_works,
+    give_up_compiling,
+)
 
 __all__ = ["Engine", "check_engine", "execute"]
 
 Engine = Literal["auto", "eager", "compiled"]
-
-_state = {"works": True}
 
 
 def check_engine(engine: str) -> None:
@@ -44,23 +44,14 @@ def execute(function: Callable[..., Any], compile_it: bool, *arguments: Any) -> 
     Returns:
         What the function returns.
     """
-    if compile_it and _state["works"]:
+    if compile_it and compiler_works():
         try:
             return _compiled(function)(*arguments)
         except compiler_errors() as error:
-            _state["works"] = False
-            reason = (str(error).splitlines() or [type(error).__name__])[0]
-            warn_no_compiler(reason)
+            give_up_compiling(error)
     return function(*arguments)
 
 
 @functools.cache
 def _compiled(function: Callable[..., Any]) -> Callable[..., Any]:
-    # Closures of one factory share their code, and torch counts compilations per code object:
-    # with a copy of the code each kind of body and texture has a count of its own.
-    code = function.__code__.replace(co_name=function.__name__)
-    own = FunctionType(
-        code, function.__globals__, function.__name__, function.__defaults__, function.__closure__
-    )
-    load_compiler()
-    return torch.compile(own, dynamic=False, fullgraph=True)
+    return compile_alone(function, dynamic=False, fullgraph=True)
