@@ -10,6 +10,7 @@ from torch import Tensor
 from torchblur.filters.base import FilterConfig, Values
 from torchblur.filters.revealed import background_share
 from torchblur.frame import Frame, Shutter
+from torchblur.ops.cubic import read_cubic
 from torchblur.ops.gather import Inputs, Lookup, Planes, read
 from torchblur.ops.noise import NoiseKind
 from torchblur.ops.tiles import neighbor_max, tile_max
@@ -30,7 +31,7 @@ __all__ = [
     "texture_of",
 ]
 
-ColorLookup = Literal["nearest", "bilinear", "opportunistic"]
+ColorLookup = Literal["nearest", "bilinear", "cubic", "opportunistic"]
 
 _WEIGHTS = "McGuire 2012, section 3.3 (restated by Tan 2022, appendix, eq. 5-10)"
 
@@ -300,17 +301,19 @@ def sample(inputs: Inputs, x: Tensor, y: Tensor, color_lookup: ColorLookup) -> T
 
     Args:
         inputs: "texture" from `texture_of`; "linear" (0 or 1) for an opportunistic lookup; the
-            planes of `revealed_inputs`, if any, and "depth".
+            planes of `revealed_inputs`, if any, and "depth"; "texture_detail" for a cubic lookup.
         x: Column, px.
         y: Row, px.
-        color_lookup: Lookup of the color (and of its validity): nearest, bilinear, or bilinear
-            where "linear" is 1. All else is nearest.
+        color_lookup: Lookup of the color (and of its validity): nearest, bilinear, cubic, or
+            bilinear where "linear" is 1. All else is nearest.
 
     Returns:
         The tap; what shows the revealed layer has its color.
     """
     ux, uy, size, depth, *near = read(inputs, x, y)
-    if color_lookup != "nearest":
+    if color_lookup == "cubic":
+        near = list(read_cubic(inputs, x, y, slice(4, None)))
+    elif color_lookup != "nearest":
         fine = read(inputs, x, y, "bilinear", slice(4, None))
         if color_lookup == "opportunistic":
             linear = inputs["linear"] > 0
