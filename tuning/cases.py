@@ -33,6 +33,8 @@ class Case:
         shutter: The shutter that the reference was made with.
         identity: Hash of the sharp frame's source; equal for copies of one frame.
         origin: Hash of the scene, or the folder and file pattern: equal for frames of a sequence.
+        item: Key of the data's item that it comes from; equal for frames that share its weight.
+        weight: Of that item, if it has one.
     """
 
     name: str
@@ -44,6 +46,8 @@ class Case:
     shutter: Shutter
     identity: str
     origin: str
+    item: str = ""
+    weight: float | None = None
 
     @property
     def size(self) -> tuple[int, int]:
@@ -90,6 +94,8 @@ class SequenceCase:
         identities: Hash of each frame's source; equal for copies of one frame.
         origin: Hash of the scene, or the folder and file pattern.
         seed: Seed of the stream: the same frames with another one are no repetition.
+        item: As in `Case`.
+        weight: As in `Case`.
     """
 
     name: str
@@ -105,6 +111,8 @@ class SequenceCase:
     identities: tuple[str, ...]
     origin: str
     seed: int = 0
+    item: str = ""
+    weight: float | None = None
 
     def __len__(self) -> int:
         return len(self.references)

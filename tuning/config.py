@@ -135,6 +135,11 @@ def resolve(
     filter_spec = _checked_params(filter_spec, place)
     for name, limits in filter_spec.free.items():
         _check_range(filter_spec, name, limits, f"{place}: " if place else "")
+    if config.objective.reduction != "mean" and config.data.is_weighted:
+        raise ConfigError(
+            "weights of the data (`weight`, crops.unbiased) belong to a mean, got "
+            f"{config.objective.reduction!r} ({_join(place, 'objective.reduction')})"
+        )
     root = str(((root_folder or folder) / config.data.root).resolve())
     config = config.model_copy(
         update={"filter": filter_spec, "data": config.data.model_copy(update={"root": root})}

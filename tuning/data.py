@@ -1,7 +1,8 @@
-"""Frames with their references: scenes, rendered once and cached, and EXR files."""
+"""Frames with their references: scenes, given or drawn, rendered once and cached; EXR files."""
 
 from __future__ import annotations
 
+import dataclasses
 import hashlib
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -14,17 +15,20 @@ from torchblur.errors import ConfigError, FileFormatError
 from torchblur.frame import Frame
 from torchblur.io import read_frame, read_image
 from torchblur.metrics import border_band
-from torchblur.render import load_scene, render_frame, render_reference
+from torchblur.render import Scene, load_scene, render_frame, render_reference
 from tuning.cases import AnyCase, Case, SequenceCase, refuse_repeats, with_unique_names
 from tuning.data_config import (
     DataItem,
     DataSpec,
     ExrData,
     ExrStreamData,
+    FamilyData,
+    FamilyStreamData,
     SceneData,
     SceneStreamData,
 )
-from tuning.frame_cache import cache_folder, cache_key, cached, frame_of, hash_scene, planes_of
+from tuning.drawing import drawn_scenes
+from tuning.frame_cache import cache_folder, cache_key, cached, frame_of, planes_of
 from tuning.numbering import frame_numbers, numbered_file
 from tuning.streams import ExrStreamJob, SceneStreamJob
 
@@ -52,16 +56,17 @@ def load_cases(
         TorchblurError: a file that is missing or cannot be read.
     """
     jobs = [
-        (split, job)
+        (split, key, item.weight, job)
         for split, items in (("train", spec.train), ("holdout", spec.holdout))
-        for index, item in enumerate(items)
-        for job in _jobs(Path(spec.root), item, f"data.{split}.{index}")
+        for key, item in ((f"data.{split}.{i}", item) for i, item in enumerate(items))
+        for job in _jobs(Path(spec.root), item, key)
     ]
     cases: list[AnyCase] = []
-    for index, (split, job) in enumerate(jobs):
+    for index, (split, key, weight, job) in enumerate(jobs):
         if report is not None:
             report(index, len(jobs), job.name)
-        cases.append(job.load(split).to(device))
+        case = job.load(split).to(device)
+        cases.append(dataclasses.replace(case, item=key, weight=weight))
     refuse_repeats(cases)
     return with_unique_names(cases)
 
@@ -71,17 +76,18 @@ def load_cases(
 
 @dataclass(frozen=True, kw_only=True)
 class _SceneJob:
-    path: Path
+    stem: str
+    scene: Scene
     item: SceneData
     time: float
 
     @property
     def name(self) -> str:
-        return f"{self.path.stem} {self.time:g}"
+        return f"{self.stem} {self.time:g}"
 
     def load(self, split: str) -> Case:
-        scene_key = hash_scene(self.path)
-        settings = self.item.model_dump(exclude={"path", "frames"})
+        scene_key = self.scene.fingerprint()
+        settings = self.item.model_dump(exclude={"path", "frames", "weight"})
         tensors = cached(cache_key(scene_key, settings, self.time), self._render)
         frame = frame_of(tensors, "frame", self.name)
         return Case(
@@ -97,7 +103,7 @@ class _SceneJob:
         )
 
     def _render(self) -> dict[str, Tensor]:
-        item, scene = self.item, load_scene(self.path)
+        item, scene = self.item, self.scene
         size = item.height_width
         frame = render_frame(scene, size, frame=self.time, color_spp=item.color_spp, seed=item.seed)
         # The sharp color and the reference must not share their noise.
@@ -149,26 +155,41 @@ class _ExrJob:
         return self.folder / numbered_file(pattern, self.number)
 
 
-def _jobs(
-    root: Path, item: DataItem, key: str
-) -> Iterator[_SceneJob | _ExrJob | SceneStreamJob | ExrStreamJob]:
+_AnyJob = _SceneJob | _ExrJob | SceneStreamJob | ExrStreamJob
+
+
+def _jobs(root: Path, item: DataItem, key: str) -> Iterator[_AnyJob]:
     path = root / item.path
-    if isinstance(item, (SceneData, SceneStreamData)):
-        if not path.is_file():
-            raise ConfigError(f"the scene {path} does not exist{_neighbors(path)} ({key}.path)")
-    elif not path.is_dir():
-        raise ConfigError(f"the folder {path} does not exist{_neighbors(path)} ({key}.path)")
-    if isinstance(item, SceneStreamData):
-        yield SceneStreamJob(path=path, item=item)
-    elif isinstance(item, ExrStreamData):
-        numbers = item.frames or frame_numbers(path, item.stream[0], f"{key}.stream")
-        yield ExrStreamJob(folder=path, item=item, numbers=tuple(numbers))
-    elif isinstance(item, SceneData):
-        for time in item.frames:
-            yield _SceneJob(path=path, item=item, time=time)
+    if isinstance(item, (ExrData, ExrStreamData)):
+        if not path.is_dir():
+            raise ConfigError(f"the folder {path} does not exist{_neighbors(path)} ({key}.path)")
+        yield from _file_jobs(path, item, key)
+        return
+    if not path.is_file():
+        kind = item.kind.removesuffix("_stream")
+        raise ConfigError(f"the {kind} {path} does not exist{_neighbors(path)} ({key}.path)")
+    if isinstance(item, (FamilyData, FamilyStreamData)):
+        for stem, scene, one in drawn_scenes(path, item):
+            yield from _scene_jobs(stem, scene, one)
     else:
-        for number in _exr_numbers(path, item, key):
-            yield _ExrJob(folder=path, item=item, number=number)
+        yield from _scene_jobs(path.stem, load_scene(path), item)
+
+
+def _scene_jobs(stem: str, scene: Scene, item: SceneData | SceneStreamData) -> Iterator[_AnyJob]:
+    if isinstance(item, SceneStreamData):
+        yield SceneStreamJob(stem=stem, scene=scene, item=item)
+        return
+    for time in item.frames:
+        yield _SceneJob(stem=stem, scene=scene, item=item, time=time)
+
+
+def _file_jobs(folder: Path, item: ExrData | ExrStreamData, key: str) -> Iterator[_AnyJob]:
+    if isinstance(item, ExrStreamData):
+        numbers = item.frames or frame_numbers(folder, item.stream[0], f"{key}.stream")
+        yield ExrStreamJob(folder=folder, item=item, numbers=tuple(numbers))
+        return
+    for number in _exr_numbers(folder, item, key):
+        yield _ExrJob(folder=folder, item=item, number=number)
 
 
 def _exr_numbers(folder: Path, item: ExrData, key: str) -> Sequence[int | None]:

@@ -1,11 +1,11 @@
-"""What a fit is told of its data: scenes to render and files to read, frames and sequences."""
+"""What a fit is told of its data: scenes to render or draw, files to read; frames, sequences."""
 
 from __future__ import annotations
 
 import itertools
 from typing import Annotated, Any, Literal
 
-from pydantic import AfterValidator, BeforeValidator, Field, field_validator
+from pydantic import AfterValidator, BeforeValidator, Field, field_validator, model_validator
 from pydantic_core import PydanticCustomError
 
 from torchblur.frame import LONGEST_SHUTTER, Shutter, ShutterPosition
@@ -17,9 +17,19 @@ __all__ = [
     "DataSpec",
     "ExrData",
     "ExrStreamData",
+    "FamilyData",
+    "FamilyStreamData",
     "SceneData",
     "SceneStreamData",
 ]
+
+
+class _Weighted(Config):
+    weight: Annotated[float, Field(gt=0)] | None = Field(
+        None,
+        description="share of this item in the fit, however many frames it has; where no item "
+        "has one all frames or windows count alike, else it is 1 if left out",
+    )
 
 
 class _Exposed(Config):
@@ -54,18 +64,44 @@ class _Sized(Config):
         return height, width
 
 
-class SceneData(_Sized, _Exposed):
+class _Rendered(_Sized, _Exposed, _Weighted):
+    """Frames that torchblur renders and keeps."""
+
+    frames: tuple[float, ...] = Field((0.0,), min_length=1, description="times, in frames")
+    spp: int = Field(256, ge=2, description="samples per pixel of the reference")
+    color_spp: int = Field(16, ge=1, description="samples per pixel of the sharp color")
+
+
+class SceneData(_Rendered):
     """Frames of a procedural scene, rendered by torchblur and cached."""
 
     kind: Literal["scene"]
     path: str = Field(description="scene file")
-    frames: tuple[float, ...] = Field((0.0,), min_length=1, description="times, in frames")
-    spp: int = Field(256, ge=2, description="samples per pixel of the reference")
-    color_spp: int = Field(16, ge=1, description="samples per pixel of the sharp color")
     seed: int = Field(0, ge=0, description="seed of the renderer")
 
 
-class ExrData(_Exposed):
+class _Drawn(Config):
+    """Scenes of a family."""
+
+    path: str = Field(description="file of the family")
+    scenes: int = Field(16, ge=1, le=10_000, description="number of scenes")
+    seed: int = Field(
+        0, ge=0, description="of the first scene, each has the next; also that of its renderer"
+    )
+
+    @property
+    def seeds(self) -> range:
+        """The seeds of the scenes."""
+        return range(self.seed, self.seed + self.scenes)
+
+
+class FamilyData(_Drawn, _Rendered):
+    """Frames of scenes drawn at random from a family, rendered by torchblur and cached."""
+
+    kind: Literal["family"]
+
+
+class ExrData(_Exposed, _Weighted):
     """Frames of another renderer, as EXR files in one folder."""
 
     kind: Literal["exr"]
@@ -108,7 +144,7 @@ _Numbers = Annotated[
 ]
 
 
-class _Stream(_Exposed):
+class _Stream(_Exposed, _Weighted):
     """A sequence in its order; a new shot begins at cuts and where numbers are left out."""
 
     shutter: Annotated[float, Field(ge=0, le=LONGEST_SHUTTER)] = Field(
@@ -120,11 +156,9 @@ class _Stream(_Exposed):
     )
 
 
-class SceneStreamData(_Sized, _Stream):
-    """A sequence of a procedural scene: each sample at its own random time, and references."""
+class _RenderedStream(_Sized, _Stream):
+    """Sequences that torchblur renders and keeps."""
 
-    kind: Literal["scene_stream"]
-    path: str = Field(description="scene file")
     frames: _Numbers = Field(
         tuple(range(8)), description="frame numbers: a list, or {start: 0, stop: 8} for 0 to 7"
     )
@@ -136,7 +170,20 @@ class SceneStreamData(_Sized, _Stream):
         description="what references average over: the time at the pixel's center, to which the "
         "stream converges, or the pixel's area too",
     )
+
+
+class SceneStreamData(_RenderedStream):
+    """A sequence of a procedural scene: each sample at its own random time, and references."""
+
+    kind: Literal["scene_stream"]
+    path: str = Field(description="scene file")
     seed: int = Field(0, ge=0, description="seed of the renderer")
+
+
+class FamilyStreamData(_Drawn, _RenderedStream):
+    """A sequence of each of several scenes drawn at random from a family."""
+
+    kind: Literal["family_stream"]
 
 
 class ExrStreamData(_Stream):
@@ -175,12 +222,13 @@ class ExrStreamData(_Stream):
 
 
 DataItem = Annotated[
-    SceneData | ExrData | SceneStreamData | ExrStreamData, Field(discriminator="kind")
+    SceneData | FamilyData | ExrData | SceneStreamData | FamilyStreamData | ExrStreamData,
+    Field(discriminator="kind"),
 ]
 
 
 class Crops(Config):
-    """Windows to fit on, instead of full frames; more of them where something moves."""
+    """Windows to fit on, instead of full frames, where something moves or where the error is."""
 
     size: int = Field(128, ge=16, description="edge of the scored window, px")
     per_frame: int = Field(4, ge=1, description="windows of each frame, or of each sequence")
@@ -188,6 +236,16 @@ class Crops(Config):
         None,
         ge=0,
         description="px around it that are filtered and not scored; twice the tile if left out",
+    )
+    choose: Literal["motion", "error"] = Field(
+        "motion",
+        description="by chance in proportion to the window's moving pixels, or to the error "
+        "(FLIP) of the filter at the start of the fit",
+    )
+    unbiased: bool = Field(
+        False,
+        description="weigh each window by the inverse of its chance, so that the windows stand "
+        "for the whole frame, not for its hard places",
     )
 
 
@@ -198,3 +256,41 @@ class DataSpec(Config):
     train: tuple[DataItem, ...] = Field(min_length=1, description="frames to fit")
     holdout: tuple[DataItem, ...] = Field((), description="frames for the evaluation alone")
     crops: Crops | None = Field(None, description="fit on windows; on full frames if left out")
+
+    @property
+    def is_weighted(self) -> bool:
+        """Whether windows may count differently in the fit."""
+        by_item = any(item.weight is not None for item in self.train)
+        return by_item or (self.crops is not None and self.crops.unbiased)
+
+    @model_validator(mode="after")
+    def _is_split_by_scene(self) -> DataSpec:
+        held = _families(self.holdout)
+        for index, item in _families(self.train):
+            for other, twin in held:
+                if item.seed < twin.seeds.stop and twin.seed < item.seeds.stop:
+                    raise _refusal(
+                        "scenes of one seed are alike, so the seeds of families in `train` and "
+                        f"`holdout` must differ: train.{index} has {_seeds(item)}, "
+                        f"holdout.{other} has {_seeds(twin)}"
+                    )
+        return self
+
+    @model_validator(mode="after")
+    def _holdout_is_not_weighted(self) -> DataSpec:
+        for index, item in enumerate(self.holdout):
+            if item.weight is not None:
+                raise _refusal(
+                    "`weight` counts in the fit, and hold-out figures are plain means over "
+                    f"frames; got {item.weight:g} in holdout.{index}"
+                )
+        return self
+
+
+def _families(items: tuple[DataItem, ...]) -> list[tuple[int, _Drawn]]:
+    return [(index, item) for index, item in enumerate(items) if isinstance(item, _Drawn)]
+
+
+def _seeds(item: _Drawn) -> str:
+    first, last = item.seeds[0], item.seeds[-1]
+    return f"{first}" if first == last else f"{first} to {last}"

@@ -23,9 +23,10 @@ Inner = tuple[tuple[int, int, int, int], ...]
 
 @dataclass(frozen=True, eq=False)
 class FrameGroup:
-    """Windows of single frames."""
+    """Windows of single frames; the objective of each is that times its weight."""
 
     frame: Frame
+    weight: Tensor
     shutter: Tensor
     position: str
     inner: Inner
@@ -41,13 +42,14 @@ class FrameGroup:
         """Yield the objective of each window, or of each parameter set, (M,) or (K,)."""
         image = blurred(blur, self.frame, self.shutter, self.position, values, free)
         safe, finite = _scored(image, self.inner)
-        yield _checked(self.objective(safe), finite)
+        yield _checked(self.objective(safe), finite) * self.weight.to(safe)
 
 
 @dataclass(frozen=True, eq=False)
 class SequenceGroup:
     """Windows of sequences; the parts of their objective are those of up to k frames each."""
 
+    weight: Tensor
     steps: tuple[tuple[Frame, ...], ...]
     cuts: tuple[int, ...]
     warm_up: int
@@ -80,7 +82,7 @@ class SequenceGroup:
         before: Tensor | None = None
         for index, image in enumerate(images):
             safe, finite = _scored(image, self.inner)
-            loss = _checked(self._loss(index, safe, before), finite)
+            loss = _checked(self._loss(index, safe, before), finite) * self.weight.to(safe)
             total = loss if total is None else total + loss
             before = safe
             if unroll is not None and (index + 1) % unroll == 0:
@@ -125,11 +127,13 @@ def join(samples: Sequence[AnySample], spec: ObjectiveSpec) -> AnyGroup:
     first = samples[0]
     opens = [s.shutter.open for s in samples]
     shutter = torch.tensor(opens, dtype=torch.float64, device=first.device).view(-1, 1, 1, 1)
+    weight = torch.tensor([s.weight for s in samples], dtype=torch.float64)
     inner = tuple(s.inner for s in samples)
     if isinstance(first, Sample):
         singles = [s for s in samples if isinstance(s, Sample)]
         return FrameGroup(
             frame=_stacked([s.frame for s in singles]),
+            weight=weight,
             shutter=shutter,
             position=first.shutter.position,
             inner=inner,
@@ -137,6 +141,7 @@ def join(samples: Sequence[AnySample], spec: ObjectiveSpec) -> AnyGroup:
         )
     windows = [s for s in samples if isinstance(s, SequenceSample)]
     return SequenceGroup(
+        weight=weight,
         steps=tuple(
             tuple(_stacked([w.steps[t][k] for w in windows]) for k in range(len(step)))
             for t, step in enumerate(first.steps)

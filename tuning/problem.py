@@ -25,8 +25,8 @@ _PIXELS_PER_BATCH = {"cpu": 1 << 18, "cuda": 1 << 23}
 class Problem:
     """The objective over windows, for one set of parameters or for many at once.
 
-    Each sequence counts as much as each single frame. With many sets each window is filtered with
-    all of them in one call; with one set as many windows as fit are filtered in one call.
+    Each sequence counts as much as each single frame, times the window's weight. With many sets
+    each window is filtered with all of them in one call; with one set as many windows as fit are.
 
     Args:
         blur: The filter; its config has the fixed values.

@@ -15,10 +15,10 @@ from torchblur.errors import ConfigError, FileFormatError
 from torchblur.frame import Frame, Sequence
 from torchblur.io import read_frame, read_image
 from torchblur.metrics import border_band
-from torchblur.render import load_scene, render_frame, render_reference, render_stream
+from torchblur.render import Scene, render_frame, render_reference, render_stream
 from tuning.cases import SequenceCase
 from tuning.data_config import ExrStreamData, SceneStreamData
-from tuning.frame_cache import cache_key, cached, frame_of, hash_scene, planes_of
+from tuning.frame_cache import cache_key, cached, frame_of, planes_of
 from tuning.numbering import numbered_file
 
 __all__ = ["ExrStreamJob", "SceneStreamJob", "shot_starts"]
@@ -29,17 +29,19 @@ class SceneStreamJob:
     """A sequence of a scene that is to be rendered.
 
     Args:
-        path: The scene.
+        stem: Name of the scene.
+        scene: The scene.
         item: How.
     """
 
-    path: Path
+    stem: str
+    scene: Scene
     item: SceneStreamData
 
     @property
     def name(self) -> str:
         """Name of the case: scene and frame numbers."""
-        return f"{self.path.stem} {_span(self.item.frames)}"
+        return f"{self.stem} {_span(self.item.frames)}"
 
     def load(self, split: str) -> SequenceCase:
         """Render the frames that the cache does not have.
@@ -47,13 +49,13 @@ class SceneStreamJob:
         Raises:
             ConfigError: a cut that is no frame.
         """
-        item, scene_key = self.item, hash_scene(self.path)
-        settings = item.model_dump(exclude={"path", "frames", "cuts", "warm_up"})
+        item, scene_key = self.item, self.scene.fingerprint()
+        settings = item.model_dump(exclude={"path", "frames", "cuts", "warm_up", "weight"})
         kept = [
             cached(cache_key(scene_key, settings, float(n)), lambda n=n: self._render(float(n)))  # type: ignore[misc]
             for n in item.frames
         ]
-        sources = [f"{self.path.stem} {number}" for number in item.frames]
+        sources = [f"{self.stem} {number}" for number in item.frames]
         cuts = shot_starts(item.frames, item.cuts, self.name)
         sharp = [frame_of(t, "sharp", s) for t, s in zip(kept, sources, strict=True)]
         streams = (
@@ -77,7 +79,7 @@ class SceneStreamJob:
         )
 
     def _render(self, time: float) -> dict[str, Tensor]:
-        item, scene = self.item, load_scene(self.path)
+        item, scene = self.item, self.scene
         size, shutter = item.height_width, item.exposure
         stream = render_stream(
             scene, size, frame=time, shutter=shutter, spp=item.stream_spp, seed=item.seed

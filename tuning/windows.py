@@ -1,4 +1,4 @@
-"""What a fit evaluates: full frames and sequences, or windows where something moves."""
+"""What a fit evaluates: full frames and sequences, or windows where it moves or goes wrong."""
 
 from __future__ import annotations
 
@@ -14,6 +14,8 @@ from torchblur.filters import BlurFilter
 from torchblur.frame import Frame, Shutter
 from tuning.cases import AnyCase, Case
 from tuning.data_config import Crops
+from tuning.error_maps import error_map
+from tuning.mixture import window_weights
 
 __all__ = ["AnySample", "Sample", "SequenceSample", "make_samples"]
 
@@ -31,6 +33,7 @@ class Sample:
         band: The scored part of the band, (1, 1, h, w).
         inner: Top, left, height and width of the scored part within the window, px.
         shutter: The shutter of the reference.
+        weight: How much it counts in the mean over windows; on average 1.
     """
 
     frame: Frame
@@ -38,6 +41,7 @@ class Sample:
     band: Tensor
     inner: tuple[int, int, int, int]
     shutter: Shutter
+    weight: float = 1.0
 
     @property
     def size(self) -> tuple[int, int]:
@@ -63,6 +67,7 @@ class SequenceSample:
         bands: The scored part of each band, (1, 1, h, w).
         inner: Top, left, height and width of the scored part within the window, px.
         shutter: The shutter of the references.
+        weight: How much it counts in the mean over windows; on average 1.
     """
 
     steps: tuple[tuple[Frame, ...], ...]
@@ -72,6 +77,7 @@ class SequenceSample:
     bands: tuple[Tensor, ...]
     inner: tuple[int, int, int, int]
     shutter: Shutter
+    weight: float = 1.0
 
     @property
     def size(self) -> tuple[int, int]:
@@ -97,7 +103,8 @@ def make_samples(
 ) -> list[AnySample]:
     """Return what a fit evaluates: the full frames, or windows of them.
 
-    Windows are drawn where something moves: the chance of a place is its number of moving pixels.
+    Windows are drawn without repetition where something moves, or where the filter is wrong at
+    the start of the fit: the chance of a place is its number of moving pixels, or its FLIP.
     A window is filtered with context around it, so that the filter's reach does not end at its
     edge, and only the inner part is scored. Its origin is a multiple of the tile, so that tiles
     lie as in the full frame. A window of a sequence is the same in all of its frames.
@@ -107,16 +114,27 @@ def make_samples(
         crops: Windows, or None for full frames.
         tile_size: Tile of the filter, px.
         seed: Of the places.
-        blur: The filter that is fitted: it decides which frames of a sequence it takes, see
-            `SequenceCase.steps`.
+        blur: The filter that is fitted, with its start values: it decides which frames of a
+            sequence it takes, see `SequenceCase.steps`, and where its error is. Without one the
+            error is that of a blur along the pixel's own velocity.
     """
     generator = torch.Generator().manual_seed(seed)
-    places = [[(0, 0)] if crops is None else _places(case, crops, generator) for case in cases]
+    places = [_places(case, crops, generator, blur) for case in cases]
+    weights = window_weights(cases, [len(some) for some in places])
     return [
-        _cut_out(case, _box(case.size, top, left, crops, tile_size), blur)
-        for case, corners in zip(cases, places, strict=True)
-        for top, left in corners
+        _cut_out(case, _box(case.size, place, crops, tile_size), blur, weight * place.weight)
+        for case, some, weight in zip(cases, places, weights, strict=True)
+        for place in some
     ]
+
+
+@dataclass(frozen=True)
+class _Place:
+    """Top left corner of a window's scored part, px, and its weight among those of its case."""
+
+    top: int
+    left: int
+    weight: float = 1.0
 
 
 @dataclass(frozen=True)
@@ -134,7 +152,7 @@ class _Box:
         return frame if frame.size == self.outer[2:] else frame.crop(*self.outer)
 
 
-def _cut_out(case: AnyCase, box: _Box, blur: BlurFilter | None) -> AnySample:
+def _cut_out(case: AnyCase, box: _Box, blur: BlurFilter | None, weight: float) -> AnySample:
     if isinstance(case, Case):
         return Sample(
             frame=box.filtered(case.frame),
@@ -142,6 +160,7 @@ def _cut_out(case: AnyCase, box: _Box, blur: BlurFilter | None) -> AnySample:
             band=box.scored(case.band),
             inner=box.inner,
             shutter=case.shutter,
+            weight=weight,
         )
     return SequenceSample(
         steps=tuple(tuple(box.filtered(f) for f in step) for step in case.steps(blur)),
@@ -151,6 +170,7 @@ def _cut_out(case: AnyCase, box: _Box, blur: BlurFilter | None) -> AnySample:
         bands=tuple(box.scored(band) for band in case.bands),
         inner=box.inner,
         shutter=case.shutter,
+        weight=weight,
     )
 
 
@@ -161,22 +181,33 @@ def _moving(case: AnyCase) -> Tensor:
     return torch.stack([m.to(device="cpu", dtype=torch.float64) for m in moves]).mean(dim=0)
 
 
-def _places(case: AnyCase, crops: Crops, generator: torch.Generator) -> list[tuple[int, int]]:
-    """Draw top left corners, without repetition, where pixels move."""
+def _places(
+    case: AnyCase, crops: Crops | None, generator: torch.Generator, blur: BlurFilter | None
+) -> list[_Place]:
+    """Draw windows, without repetition, by how much moves or how much is wrong in them."""
+    if crops is None:
+        return [_Place(0, 0)]
     height, width = (min(crops.size, edge) for edge in case.size)
     stride = max(1, crops.size // _CANDIDATE_STEPS)
-    share = F.avg_pool2d(_moving(case), (height, width), stride=stride)[0, 0]
+    map = _moving(case) if crops.choose == "motion" else error_map(case, blur)
+    share = F.avg_pool2d(map, (height, width), stride=stride)[0, 0]
     if not bool((share > 0).any()):
         share = torch.ones_like(share)
     count = min(crops.per_frame, int((share > 0).sum()))
     chosen = torch.multinomial(share.flatten(), count, generator=generator)
+    inverse = 1 / share.flatten()[chosen] if crops.unbiased else torch.ones(count)
+    weights = (inverse / inverse.mean()).tolist()
     columns = share.shape[1]
-    return [(int(i) // columns * stride, int(i) % columns * stride) for i in chosen]
+    return [
+        _Place(int(i) // columns * stride, int(i) % columns * stride, weight)
+        for i, weight in zip(chosen, weights, strict=True)
+    ]
 
 
-def _box(size: tuple[int, int], top: int, left: int, crops: Crops | None, tile_size: int) -> _Box:
+def _box(size: tuple[int, int], place: _Place, crops: Crops | None, tile_size: int) -> _Box:
     if crops is None:
         return _Box((0, 0, *size), (0, 0, *size))
+    top, left = place.top, place.left
     height, width = (min(crops.size, edge) for edge in size)
     context = 2 * tile_size if crops.context is None else crops.context
     outer_top, outer_height = _outer(top, height, size[0], context, tile_size)
