@@ -207,8 +207,16 @@ def build(model: type[ModelT], data: object, place: str = "") -> ModelT:
     try:
         return model.model_validate(data)
     except ValidationError as error:
-        lines = [_explain(dict(item), model, data, place) for item in error.errors()]
+        items = [dict(item) for item in error.errors()]
+        lines = [_explain(item, model, data, place) for item in items if not _follows(item, items)]
         raise ConfigError("\n".join(lines)) from error
+
+
+def _follows(error: dict[str, Any], others: list[dict[str, Any]]) -> bool:
+    """Return whether a list is too short only because items of it are wrong."""
+    loc = error["loc"]
+    below = any(len(o["loc"]) > len(loc) and o["loc"][: len(loc)] == loc for o in others)
+    return error["type"] == "too_short" and below
 
 
 def _explain(error: dict[str, Any], model: type[BaseModel], data: object, place: str) -> str:

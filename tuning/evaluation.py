@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -22,16 +21,7 @@ from tuning.space import Space
 from tuning.variants import Variant, render, render_frames
 from tuning.windows import make_samples
 
-__all__ = [
-    "ceiling",
-    "noise_scores",
-    "score_cases",
-    "score_image",
-    "score_variant",
-    "sensitivities",
-]
-
-_STEP = 0.05  # of each range, for the sensitivities
+__all__ = ["ceiling", "noise_scores", "score_cases", "score_image", "score_variant"]
 
 
 def score_cases(
@@ -112,32 +102,6 @@ def ceiling(
     )
     samples = make_samples([case], None, tile_size=1, seed=0, blur=blur)
     return fit_gradient(Problem(blur, samples, objective, space.names), job).params
-
-
-def sensitivities(problem: Problem, space: Space, values: Mapping[str, Any]) -> dict[str, float]:
-    """Return how much the objective rises when a parameter moves by 5 % of its range.
-
-    Args:
-        problem: The objective.
-        space: The parameters; choices and integers are left out.
-        values: Where to start, the optimum.
-
-    Returns:
-        Relative rise by name, the worse of both directions that lie within the range. Below 0
-        if the objective would still fall.
-    """
-    floats = space.continuous()
-    if not floats.names:
-        return {}
-    fixed = {name: value for name, value in values.items() if name not in floats.names}
-    center = floats.to_unit(values)
-    moves = torch.eye(len(floats.names), dtype=torch.float64) * _STEP
-    points = torch.cat([center[None], center + moves, center - moves])
-    inside = ((points >= 0) & (points <= 1)).all(dim=1)
-    losses = problem.mean(fixed | floats.from_unit(points.clamp(0, 1)), len(points))
-    rises = torch.where(inside, losses / losses[0].clamp_min(1e-12) - 1, -math.inf)[1:]
-    worst = rises.view(2, -1).max(dim=0).values.tolist()
-    return dict(zip(floats.names, worst, strict=True))
 
 
 def score_image(case: Case, variant: str, image: Tensor) -> CaseScore:

@@ -15,15 +15,16 @@ from typing import Any
 from torchblur.filters import BlurFilter, get_filter
 from torchblur.presets import Preset, save_preset
 from tuning.cases import AnyCase, SequenceCase
-from tuning.config import TuneConfig, resolve
-from tuning.evaluation import ceiling, score_cases, score_variant, sensitivities
+from tuning.config import GradientMethod, TuneConfig, resolve
+from tuning.evaluation import ceiling, score_cases, score_variant
 from tuning.methods import run_methods
 from tuning.preparation import fit_device, prepare
 from tuning.problem import Problem
 from tuning.progress import Progress, ProgressEvent, Stage
 from tuning.report import write_report
-from tuning.result import CaseScore, FitResult, MethodResult, ParameterResult
+from tuning.result import CaseScore, FitResult, MethodResult, ParameterResult, SensitivityResult
 from tuning.runfolder import RunFolder, open_run
+from tuning.sensitivity import measure_sensitivity
 from tuning.space import Space
 from tuning.variants import Variant
 
@@ -136,7 +137,9 @@ def _evaluate(
     variants = _variants(setting, methods, tuned)
     stage = Stage("evaluation", len(setting.cases), setting.progress)
     scores = score_cases(setting.cases, variants, stage) + _ceiling_scores(setting, tuned)
-    rises = sensitivities(setting.problem, setting.space, tuned)
+    slopes = measure_sensitivity(
+        setting.problem, setting.space, start, tuned, _unroll(setting.config)
+    )
     params = setting.config.filter.params | tuned | _common_shutter(setting)
     result = FitResult(
         filter=setting.config.filter.kind,
@@ -144,7 +147,7 @@ def _evaluate(
         chosen=best.name if improved else "start",
         start_objective=start_objective,
         objective=best.objective if improved else start_objective,
-        parameters=_parameters(setting.space, tuned, rises),
+        parameters=_parameters(setting.space, tuned, slopes),
         methods=tuple(methods),
         scores=tuple(scores),
         notes=setting.notes,
@@ -199,11 +202,11 @@ def _ceiling_scores(setting: _Setting, tuned: dict[str, Any]) -> list[CaseScore]
 
 
 def _parameters(
-    space: Space, tuned: dict[str, Any], rises: dict[str, float]
+    space: Space, tuned: dict[str, Any], slopes: dict[str, SensitivityResult]
 ) -> tuple[ParameterResult, ...]:
     rows = []
     for parameter in space.parameters:
-        spec = parameter.spec
+        spec, slope = parameter.spec, slopes.get(parameter.name)
         low, high = (None, None) if parameter.choices else spec.bounds
         rows.append(
             ParameterResult(
@@ -219,10 +222,16 @@ def _parameters(
                 high=high,
                 choices=parameter.choices,
                 scale=spec.scale,
-                sensitivity=rises.get(parameter.name),
+                sensitivity=None if slope is None else slope.rise,
+                slopes=slope,
             )
         )
     return tuple(rows)
+
+
+def _unroll(config: TuneConfig) -> int | None:
+    """Return through how many frames the methods let gradients go back, or all."""
+    return next((m.unroll for m in config.methods if isinstance(m, GradientMethod)), None)
 
 
 def _common_shutter(setting: _Setting) -> dict[str, Any]:

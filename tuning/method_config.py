@@ -21,6 +21,9 @@ __all__ = [
 ]
 
 
+_LEAST_GENERATION = 4  # of fewer CMA-ES cannot learn
+
+
 class _MethodBase(Config):
     free: tuple[str, ...] | None = Field(
         None, min_length=1, description="the free parameters that this method fits; all if left out"
@@ -144,13 +147,24 @@ def check_method(
 
     Raises:
         ConfigError: a parameter without a usable gradient; nothing to polish; a sampler that
-            cannot learn from what is polished.
+            cannot learn from what is polished; too small a generation.
     """
     if isinstance(method, GradientMethod):
         for name in names:
             _check_gradient(name, specs[name], bool(method.free), place)
-    elif method.polish is not None:
-        _check_polish(method, names, specs, place)
+    else:
+        _check_generation(method, place)
+        if method.polish is not None:
+            _check_polish(method, names, specs, place)
+
+
+def _check_generation(method: BlackBoxMethod, place: str) -> None:
+    if method.sampler == "cmaes" and 1 < method.population < _LEAST_GENERATION:
+        raise ConfigError(
+            f"a generation of cmaes needs at least {_LEAST_GENERATION} candidates, got "
+            f"`population: {method.population}`; 1 leaves its size to the sampler "
+            f"({place}.population)"
+        )
 
 
 def _check_gradient(name: str, spec: Param, is_named: bool, place: str) -> None:

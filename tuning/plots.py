@@ -115,6 +115,9 @@ def _draw_trials(axes: Axes, steps: Records) -> None:
     xs = [record["step"] for record in steps]
     ys = [_number(record["loss"][0]) for record in steps]
     axes.plot(xs, ys, ".", color=color_of(0), markersize=3.5, alpha=0.6, label="trial")
+    _mark(axes, [(r["step"], r["pruned"]) for r in steps if "pruned" in r], "x", 3, "pruned")
+    polished = [(r["step"], _number(r["loss"][0])) for r in steps if "polish_of" in r]
+    _mark(axes, polished, "D", 2, "polished")
     best, lowest = [], math.inf
     for y in ys:
         lowest = lowest if math.isnan(y) else min(lowest, y)
@@ -125,6 +128,15 @@ def _draw_trials(axes: Axes, steps: Records) -> None:
         top = finite[min(len(finite) - 1, int(0.9 * len(finite)))]
         margin = 0.15 * (top - finite[0]) or 0.1 * abs(top) or 1.0
         axes.set_ylim(finite[0] - margin, top + margin)
+
+
+def _mark(
+    axes: Axes, points: Sequence[tuple[float, float]], marker: str, index: int, label: str
+) -> None:
+    """Draw trials of a special kind, if there are any."""
+    if points:
+        xs, ys = zip(*points, strict=True)
+        axes.plot(xs, ys, marker, color=color_of(index), markersize=3, alpha=0.8, label=label)
 
 
 def _draw_path(axes: Axes, steps: Records, parameter: ParameterResult, _: MethodResult) -> None:

@@ -16,8 +16,9 @@ from tuning.cases import AnyCase, SequenceCase
 from tuning.config import TuneConfig
 from tuning.page import Column, Row, Table, View, make_view, render_page
 from tuning.plots import loss_curves, parameter_paths
-from tuning.result import FitResult, ParameterResult
+from tuning.result import FitResult, MethodResult, ParameterResult
 from tuning.runfolder import RunFolder
+from tuning.sensitivity_rows import slope_rows
 from tuning.sequence_plots import score_curves
 from tuning.variants import Variant, render, render_frames
 
@@ -109,6 +110,7 @@ def write_report(
         left_out=len(ordered) - len(views),
         curves=_curves(ordered[:_MAX_VIEWS], result),
         parameter_rows=_parameter_rows(result, importances),
+        slope_rows=slope_rows(result),
         importances=importances,
         losses=loss_curves(result, records),
         method_rows=_method_rows(result),
@@ -298,8 +300,11 @@ def _method_rows(result: FitResult) -> list[dict[str, Any]]:
             if result.start_objective > 0
             else "–",
             "evaluations": method.evaluations,
+            "passes": f"{method.passes:.0f}" if method.passes else "–",
+            "found": _found(method),
             "dropped": method.dropped,
             "seconds": f"{method.seconds:.1f}",
+            "cpu_seconds": f"{method.cpu_seconds:.1f}" if method.cpu_seconds else "–",
             "starts": [
                 "dropped" if start.objective is None else f"{start.objective:.5f}"
                 for start in method.starts
@@ -307,6 +312,12 @@ def _method_rows(result: FitResult) -> list[dict[str, Any]]:
         }
         for method in result.methods
     ]
+
+
+def _found(method: MethodResult) -> str:
+    """Return what became of a search's trials beside those that are complete."""
+    counts = {"pruned": method.pruned, "polished": method.polished}
+    return ", ".join(f"{count} {name}" for name, count in counts.items() if count)
 
 
 def _paths(result: FitResult, records: Sequence[dict[str, Any]]) -> list[tuple[str, str, Markup]]:

@@ -11,7 +11,15 @@ from pydantic import Field
 from torchblur.errors import ConfigError
 from torchblur.params import Config, build
 
-__all__ = ["CaseScore", "FitResult", "FrameScore", "MethodResult", "ParameterResult", "StartResult"]
+__all__ = [
+    "CaseScore",
+    "FitResult",
+    "FrameScore",
+    "MethodResult",
+    "ParameterResult",
+    "SensitivityResult",
+    "StartResult",
+]
 
 Split = Literal["train", "holdout"]
 
@@ -51,6 +59,25 @@ class MethodResult(Config):
     """Share of each parameter in the spread of the objective, as Optuna estimates it."""
 
 
+class SensitivityResult(Config):
+    """How the objective depends on one float; null where it is not finite.
+
+    Slopes are relative changes per range: at -2, moving it up by 1 % of its range makes the
+    objective 2 % smaller.
+    """
+
+    start_gradient: float | None
+    """Slope before the fit, by autograd."""
+    start_difference: float | None
+    """The same by steps of 1 % of the range."""
+    gradient: float | None
+    """Slope after the fit, by autograd."""
+    difference: float | None
+    """The same by steps of 5 % of the range."""
+    rise: float | None
+    """Rise after the fit when it moves by 5 % of its range, the worse of both directions."""
+
+
 class ParameterResult(Config):
     """One free parameter before and after the fit."""
 
@@ -69,6 +96,8 @@ class ParameterResult(Config):
     sensitivity: float | None = None
     """Rise of the training objective, relative, when it moves by 5 % of its range (the worse of
     both directions); null for choices."""
+    slopes: SensitivityResult | None = None
+    """By gradient and by differences; null for choices and integers."""
 
 
 class FrameScore(Config):

@@ -16,10 +16,10 @@ from torchblur.presets import create_filter, load_preset
 from tuning.blackbox import BlackBoxJob, fit_blackbox
 from tuning.blurring import blurred
 from tuning.config import BlackBoxMethod, FilterSpec, GradientMethod, TuneConfig
-from tuning.evaluation import sensitivities
 from tuning.fit import run_fit
 from tuning.gradient import FitError, GradientJob, fit_gradient
 from tuning.result import FitResult
+from tuning.sensitivity import sensitivities
 from tuning.space import make_space
 
 
