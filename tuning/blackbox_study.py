@@ -40,18 +40,19 @@ class Journal:
     Args:
         folder: The run.
         index: Position of the method.
+        objectives: How many values a trial has, all of them made small.
     """
 
-    def __init__(self, folder: RunFolder, index: int) -> None:
+    def __init__(self, folder: RunFolder, index: int, objectives: int = 1) -> None:
         path = folder.path / f"study-{index}.log"
         # This process holds the run's own lock: what a killed one left here is stale.
         trim_torn_line(path)
         _remove_lock(path)
-        self._study = _open(path)
+        self._study = _open(path, objectives)
         trials = self._study.get_trials()
         whole = _whole_rounds(trials)
         if whole < len(trials):
-            self._study = _rewritten(path, trials[:whole])
+            self._study = _rewritten(path, trials[:whole], objectives)
 
     def trials(self) -> list[FrozenTrial]:
         """Return the trials of whole rounds, in order."""
@@ -68,10 +69,20 @@ class Journal:
         self._study.add_trial(trial)
 
 
-def new_study(pruner: BasePruner) -> optuna.Study:
-    """Return an empty study in memory."""
+def new_study(pruner: BasePruner | None = None, objectives: int = 1) -> optuna.Study:
+    """Return an empty study in memory.
+
+    Args:
+        pruner: Of its trials; none if left out.
+        objectives: How many values a trial has, all of them made small.
+    """
     optuna.logging.set_verbosity(optuna.logging.WARNING)
-    return optuna.create_study(storage=InMemoryStorage(), study_name=_NAME, pruner=pruner)
+    return optuna.create_study(
+        storage=InMemoryStorage(),
+        study_name=_NAME,
+        pruner=pruner or NopPruner(),
+        directions=["minimize"] * objectives,
+    )
 
 
 def make_sampler(method: BlackBoxMethod, seed: int) -> BaseSampler:
@@ -126,9 +137,13 @@ def suggest(trial: Trial, parameter: FreeParameter) -> Any:
     return trial.suggest_float(name, low, high, log=is_log)
 
 
-def _open(path: Path) -> optuna.Study:
-    storage = JournalStorage(JournalFileBackend(str(path)))
-    return optuna.create_study(storage=storage, study_name=_NAME, load_if_exists=True)
+def _open(path: Path, objectives: int) -> optuna.Study:
+    return optuna.create_study(
+        storage=JournalStorage(JournalFileBackend(str(path))),
+        study_name=_NAME,
+        directions=["minimize"] * objectives,
+        load_if_exists=True,
+    )
 
 
 def _whole_rounds(trials: list[FrozenTrial]) -> int:
@@ -137,16 +152,16 @@ def _whole_rounds(trials: list[FrozenTrial]) -> int:
     return ends[-1] + 1 if ends else 0
 
 
-def _rewritten(path: Path, trials: list[FrozenTrial]) -> optuna.Study:
+def _rewritten(path: Path, trials: list[FrozenTrial], objectives: int) -> optuna.Study:
     """Replace a journal by one with these trials alone."""
     part = path.with_name(f".{path.name}.part")
     part.unlink(missing_ok=True)
     _remove_lock(part)
-    study = _open(part)
+    study = _open(part, objectives)
     for trial in trials:
         study.add_trial(trial)
     part.replace(path)
-    return _open(path)
+    return _open(path, objectives)
 
 
 def _remove_lock(path: Path) -> None:

@@ -69,7 +69,7 @@ def evaluate_candidates(
     for key, positions in _alike(space, candidates).items():
         for first in range(0, len(positions), most):
             some = positions[first : first + most]
-            values = dict(fixed) | dict(key)
+            values = dict(fixed) | {name: value for name, value in key if name}
             if len(some) == 1:
                 values |= candidates[some[0]]
             else:

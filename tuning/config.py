@@ -19,6 +19,7 @@ from torchblur.io import load_yaml
 from torchblur.ops.gather import Engine
 from torchblur.params import Config, build, choices, declared
 from torchblur.presets import load_preset
+from tuning.cost_checks import check_costs
 from tuning.data_config import DataSpec
 from tuning.method_config import BlackBoxMethod, GradientMethod, Method, check_method
 from tuning.objective_config import ObjectiveSpec
@@ -144,8 +145,8 @@ def resolve(
     config = config.model_copy(
         update={"filter": filter_spec, "data": config.data.model_copy(update={"root": root})}
     )
-    for index in range(len(config.methods)):
-        free_names(config, index, place)
+    names = [free_names(config, index, place) for index in range(len(config.methods))]
+    check_costs(config, names, place)
     return config
 
 

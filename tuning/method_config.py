@@ -14,14 +14,16 @@ __all__ = [
     "BlackBoxMethod",
     "GradientMethod",
     "Method",
+    "ParetoMethod",
     "PolishSpec",
+    "PolishSteps",
     "PruningSpec",
     "check_method",
     "polished_names",
 ]
 
 
-_LEAST_GENERATION = 4  # of fewer CMA-ES cannot learn
+_LEAST_GENERATION = 4
 
 
 class _MethodBase(Config):
@@ -56,13 +58,18 @@ class GradientMethod(_MethodBase, _Windows):
     )
 
 
-class PolishSpec(_Windows):
-    """Gradient steps from the promising trials of a search; what they find joins the study."""
+class PolishSteps(_Windows):
+    """Gradient steps from a setting that a search found."""
 
-    steps: int = Field(15, ge=1, description="steps of Adam from one trial")
+    steps: int = Field(15, ge=1, description="steps of Adam from one setting")
     learning_rate: float = Field(
         0.03, gt=0, le=1, description="first step, as a fraction of each range; falls by a cosine"
     )
+
+
+class PolishSpec(PolishSteps):
+    """Gradient steps from the promising trials of a search; what they find joins the study."""
+
     quantile: float = Field(
         0.25, gt=0, le=1, description="a trial is polished if it is in this best share so far"
     )
@@ -111,7 +118,43 @@ class BlackBoxMethod(_MethodBase):
     pruning: PruningSpec | None = Field(None, description="few windows first")
 
 
-Method = Annotated[GradientMethod | BlackBoxMethod, Field(discriminator="kind")]
+def _standard_budgets() -> dict[str, float]:
+    return {"low": 0.25, "medium": 0.5, "high": 1.0, "ultra": 2.0}
+
+
+class ParetoMethod(_MethodBase):
+    """A search for the settings that no other one beats in both quality and cost."""
+
+    kind: Literal["pareto"]
+    sampler: Literal["nsga2", "tpe"] = Field("nsga2", description="Optuna's sampler")
+    trials: int = Field(200, ge=1, description="settings that are tried, the given ones included")
+    population: int | None = Field(
+        None,
+        ge=2,
+        description="settings drawn together, before any of them is known: what the workers of a "
+        "cluster share; of nsga2 the generation; left out: 20 with nsga2, 1 with tpe",
+    )
+    sweep: int = Field(
+        5,
+        ge=0,
+        description="the search begins at the start values (or the best so far) with so many "
+        "other values of what costs the most, the number of taps say",
+    )
+    budgets: dict[
+        Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]*$")], Annotated[float, Field(gt=0)]
+    ] = Field(
+        default_factory=_standard_budgets,
+        min_length=1,
+        description="presets by name, and what each may cost, relative to Guertin 2014 with 35 "
+        "taps",
+    )
+    polish: PolishSteps | None = Field(
+        None, description="gradient steps from each preset's setting, with its smooth parameters"
+    )
+
+
+AnyMethod = GradientMethod | BlackBoxMethod | ParetoMethod
+Method = Annotated[AnyMethod, Field(discriminator="kind")]
 
 
 def polished_names(
@@ -132,10 +175,7 @@ def polished_names(
 
 
 def check_method(
-    method: GradientMethod | BlackBoxMethod,
-    names: Collection[str],
-    specs: Mapping[str, Param],
-    place: str,
+    method: AnyMethod, names: Collection[str], specs: Mapping[str, Param], place: str
 ) -> None:
     """Refuse a method that cannot fit what it is given.
 
@@ -152,7 +192,7 @@ def check_method(
     if isinstance(method, GradientMethod):
         for name in names:
             _check_gradient(name, specs[name], bool(method.free), place)
-    else:
+    elif isinstance(method, BlackBoxMethod):
         _check_generation(method, place)
         if method.polish is not None:
             _check_polish(method, names, specs, place)

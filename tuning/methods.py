@@ -9,7 +9,8 @@ from torchblur.params import declared
 from tuning.blackbox import BlackBoxJob, fit_blackbox
 from tuning.config import TuneConfig, free_names
 from tuning.gradient import GradientJob, fit_gradient
-from tuning.method_config import GradientMethod, polished_names
+from tuning.method_config import GradientMethod, ParetoMethod, polished_names
+from tuning.pareto import ParetoJob, fit_pareto
 from tuning.problem import Problem
 from tuning.progress import Progress
 from tuning.result import MethodResult
@@ -59,6 +60,9 @@ def run_methods(
         if isinstance(method, GradientMethod):
             gradient = GradientJob(method=method, **common)
             result = fit_gradient(problem, gradient, folder, progress)
+        elif isinstance(method, ParetoMethod):
+            front = ParetoJob(method=method, **common)
+            result = fit_pareto(problem, front, folder, progress)
         else:
             specs = declared(get_filter(config.filter.kind).config_class)
             polished = polished_names(method, names, specs)
@@ -75,6 +79,6 @@ def method_name(config: TuneConfig, index: int) -> str:
         config: The configuration.
         index: Position among its methods.
     """
-    labels = [m.sampler if m.kind == "blackbox" else "gradient" for m in config.methods]
+    labels = [m.sampler if m.kind == "blackbox" else m.kind for m in config.methods]
     repeat = labels[: index + 1].count(labels[index])
     return labels[index] if repeat == 1 else f"{labels[index]} {repeat}"

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from tuning.gradient import FitError, GradientJob, fit_gradient
-from tuning.method_config import GradientMethod, PolishSpec
+from tuning.method_config import GradientMethod, PolishSteps
 from tuning.problem import Problem
 from tuning.space import Space
 
@@ -64,7 +64,7 @@ def is_promising(loss: float, before: Sequence[float], quantile: float) -> bool:
 
 
 def polish(
-    spec: PolishSpec, space: Space, fixed: Mapping[str, Any], problem: Problem, start: PolishStart
+    spec: PolishSteps, space: Space, fixed: Mapping[str, Any], problem: Problem, start: PolishStart
 ) -> Polished:
     """Go down the gradient from a trial.
 

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from torchblur.filters import BlurFilter
+from tuning.cost import cost_at
 from tuning.groups import AnyGroup, join, kind_of
 from tuning.objective_config import ObjectiveSpec
 from tuning.reduction import tail_weights
@@ -97,7 +98,6 @@ class Problem:
 
         Differentiable: yes. A set whose image is not finite gets NaN, the others are unharmed.
         """
-        number = len(self.samples) if chosen is None else len(chosen)
         weights: Tensor | None = None
         if self.objective.reduction != "mean":
             each = self.each(values, count, chosen)
@@ -105,6 +105,29 @@ class Problem:
             if not torch.is_grad_enabled():
                 yield (weights * each).sum(dim=0)
                 return
+        yield from self.weighted(values, count, weights, chosen, unroll=unroll)
+
+    def weighted(
+        self,
+        values: Mapping[str, Any],
+        count: int,
+        weights: Tensor | None,
+        chosen: Sequence[int] | None = None,
+        *,
+        unroll: int | None = None,
+    ) -> Iterator[Tensor]:
+        """Yield parts of the sum of weight times objective over windows, (K,) each.
+
+        Args:
+            values: As `losses` takes them.
+            count: K.
+            weights: Of each window for each parameter set, (n, K); left out: the mean's.
+            chosen: Positions of the windows that count; all if left out.
+            unroll: As `losses` takes it.
+
+        Differentiable: yes.
+        """
+        number = len(self.samples) if chosen is None else len(chosen)
         for places, group in self._groups_for(count, chosen):
             if weights is not None and not bool((weights[places] > 0).any()):
                 continue
@@ -114,6 +137,9 @@ class Problem:
                 else:
                     rows = losses[None] if count > 1 else losses[:, None]
                     yield (rows * weights[places].to(rows)).sum(dim=0)
+        if self.objective.cost > 0:
+            ones = torch.ones(count, dtype=torch.float64)
+            yield self._cost(values) * (ones if weights is None else weights.sum(dim=0))
 
     @torch.no_grad()
     def each(
@@ -132,7 +158,7 @@ class Problem:
             losses = torch.stack(parts).sum(dim=0)
             columns = losses[:, None] if count == 1 else losses[None]
             found |= zip(places, columns, strict=True)
-        return torch.stack([found[place] for place in range(len(found))])
+        return torch.stack([found[place] for place in range(len(found))]) + self._cost(values)
 
     @torch.no_grad()
     def mean(self, values: Mapping[str, Any], count: int = 1) -> Tensor:
@@ -149,6 +175,11 @@ class Problem:
             parts = self.losses(some, min(most, count - first))
             means.append(torch.stack([part.double().cpu() for part in parts]).sum(dim=0))
         return torch.cat(means)
+
+    def _cost(self, values: Mapping[str, Any]) -> float:
+        """Return what the cost adds to the objective, of each window and of all."""
+        weight = self.objective.cost
+        return weight * cost_at(self.blur, values).relative if weight > 0 else 0.0
 
     def _groups_for(
         self, count: int, chosen: Sequence[int] | None

@@ -10,6 +10,7 @@ from pydantic import Field
 
 from torchblur.errors import ConfigError
 from torchblur.params import Config, build
+from tuning.pareto_result import ParetoResult
 
 __all__ = [
     "CaseScore",
@@ -57,6 +58,8 @@ class MethodResult(Config):
     """Trials that gradient steps found."""
     importances: dict[str, float] = Field(default_factory=dict)
     """Share of each parameter in the spread of the objective, as Optuna estimates it."""
+    pareto: ParetoResult | None = None
+    """Of a search for the front of quality against cost."""
 
 
 class SensitivityResult(Config):

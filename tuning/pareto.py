@@ -1,0 +1,341 @@
+"""A search for the front: settings that no other one beats in both quality and cost.
+
+It is an Optuna study of two objectives, kept as that of a search for one is: worked on in memory,
+each finished trial a line of the journal, the sampler of a trial seeded by the run's seed and the
+trial's number. A round is a population; a killed run loses the round in flight alone, draws it
+again with the same values, and ends as it would have. The cost is counted, not measured, so it is
+the same on every machine.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import optuna
+from optuna.samplers import BaseSampler, NSGAIISampler, TPESampler
+from optuna.trial import FrozenTrial, Trial, TrialState, create_trial
+
+from tuning.blackbox_study import Journal, new_study, suggest
+from tuning.candidates import evaluate_candidates
+from tuning.cost import cost_at
+from tuning.gradient import FitError, seed_of
+from tuning.method_config import ParetoMethod
+from tuning.pareto_result import ParetoPoint, ParetoResult, front_of, make_point, pick
+from tuning.polish import Polished, PolishStart, polish
+from tuning.problem import Problem
+from tuning.progress import Progress, Stage
+from tuning.result import MethodResult
+from tuning.runfolder import RunFolder
+from tuning.space import FreeParameter, Space
+
+__all__ = ["ParetoJob", "fit_pareto"]
+
+_OBJECTIVES = 2
+_POPULATION = 20  # of nsga2, if not said otherwise
+_POLISH_SEED = 1 << 43
+_ENOUGH = 10  # trials; the importances of fewer tell nothing
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class ParetoJob:
+    """What a search for the front works on.
+
+    Args:
+        method: Its settings.
+        index: Its position among the methods.
+        name: Its name in results.
+        space: The parameters that it fits.
+        fixed: Values of the free parameters that it does not fit.
+        first: Points to evaluate before the sampler's; from the last one the sweep starts.
+        seed: Seed of the run.
+    """
+
+    method: ParetoMethod
+    index: int
+    name: str
+    space: Space
+    fixed: Mapping[str, Any]
+    first: tuple[Mapping[str, Any], ...]
+    seed: int
+
+
+def fit_pareto(
+    problem: Problem,
+    job: ParetoJob,
+    folder: RunFolder | None = None,
+    progress: Progress | None = None,
+) -> MethodResult:
+    """Search for the front of the objective against the cost.
+
+    Args:
+        problem: The objective.
+        job: Settings, parameters, first points.
+        folder: Where the journal and the log go; a journal that is there is gone on from.
+        progress: Who is told of each round.
+
+    Returns:
+        The point of the best objective, and in `pareto` all points, the front and the presets.
+
+    Raises:
+        FitError: no trial has a finite loss.
+    """
+    search = _Search(problem, job)
+    journal = None if folder is None else Journal(folder, job.index, _OBJECTIVES)
+    for trial in journal.trials() if journal is not None else ():
+        search.study.add_trial(trial)
+    if folder is not None:
+        folder.drop_records(job.index, 0)
+        for trial in search.study.trials:
+            _log(folder, job, trial)
+    stage = Stage(job.name, job.method.trials, progress, done=search.drawn)
+    while search.drawn < job.method.trials:
+        trials = search.round()
+        for position, trial in enumerate(trials):
+            if folder is not None and journal is not None:
+                journal.add(trial, ends_round=position == len(trials) - 1)
+                _log(folder, job, trial)
+        last = [t.values[0] for t in trials if t.state == TrialState.COMPLETE]
+        stage.step(search.drawn, loss=min(last, default=None), best=search.best)
+    return search.result(_polished(search, folder, progress))
+
+
+class _Search:
+    """The study, and what its next round depends on."""
+
+    def __init__(self, problem: Problem, job: ParetoJob) -> None:
+        self.problem, self.job = problem, job
+        self.study = new_study(objectives=_OBJECTIVES)
+        self.first = (*job.first, *_sweep(problem, job))
+
+    @property
+    def drawn(self) -> int:
+        """How many trials there are."""
+        return len(self.study.get_trials(deepcopy=False))
+
+    @property
+    def best(self) -> float | None:
+        """The least loss so far, at whatever cost."""
+        return min((t.values[0] for t in self._complete()), default=None)
+
+    def round(self) -> list[FrozenTrial]:
+        """Draw, evaluate and tell; return the finished trials in order."""
+        clock, cpu = time.monotonic(), time.process_time()
+        trials = [self._ask(number) for number in range(self.drawn, self._end_of_round())]
+        losses = self._evaluate([self._params(trial) for trial in trials])
+        for trial in trials:
+            trial.set_user_attr("seconds", (time.monotonic() - clock) / len(trials))
+            trial.set_user_attr("cpu_seconds", (time.process_time() - cpu) / len(trials))
+        return [self._tell(*pair) for pair in zip(trials, losses, strict=True)]
+
+    def points(self) -> list[ParetoPoint]:
+        """Return all trials with a finite loss."""
+        found = []
+        for trial in self._complete():
+            params = self._params(trial)
+            given = trial.number < len(self.first)
+            found.append(
+                make_point(
+                    trial.number,
+                    "given" if given else "search",
+                    params,
+                    trial.values[0],
+                    cost_at(self.problem.blur, params),
+                )
+            )
+        return found
+
+    def result(self, polished: Sequence[ParetoPoint]) -> MethodResult:
+        """Return what was found; the preset of the whole run is the best at any cost."""
+        job, trials = self.job, self.study.get_trials(deepcopy=False)
+        points = [*self.points(), *polished]
+        best = min(points, key=lambda p: (p.objective, p.cost, p.number))
+        steps = 0 if job.method.polish is None else job.method.polish.steps + 1
+        evaluations = len(trials) + steps * len(polished)
+        return MethodResult(
+            name=job.name,
+            kind="pareto",
+            params=best.params,
+            objective=best.objective,
+            evaluations=evaluations,
+            passes=evaluations,
+            seconds=sum(t.user_attrs["seconds"] for t in trials),
+            cpu_seconds=sum(t.user_attrs["cpu_seconds"] for t in trials),
+            dropped=len(trials) - len(self._complete()),
+            polished=len(polished),
+            importances=self._importances(),
+            pareto=ParetoResult(
+                points=tuple(points), front=front_of(points), picks=pick(points, job.method.budgets)
+            ),
+        )
+
+    def _complete(self) -> list[FrozenTrial]:
+        return self.study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,))
+
+    def _params(self, trial: Trial | FrozenTrial) -> dict[str, Any]:
+        """Return all free parameters, as they would stand in a preset."""
+        return dict(self.job.fixed) | self.job.space.rounded(trial.params)
+
+    def _end_of_round(self) -> int:
+        """Given points are a round of their own, so that populations are whole."""
+        given = min(len(self.first), self.job.method.trials)
+        size = _population(self.job.method)
+        return given if self.drawn < given else min(self.drawn + size, self.job.method.trials)
+
+    def _ask(self, number: int) -> Trial:
+        self.study.sampler = _sampler(
+            self.job.method, seed_of(self.job.seed, self.job.index, number)
+        )
+        if number < len(self.first):
+            point = self.first[number]
+            self.study.enqueue_trial({name: point[name] for name in self.job.space.names})
+        trial = self.study.ask()
+        for parameter in self.job.space.parameters:
+            suggest(trial, parameter)
+        return trial
+
+    def _evaluate(self, candidates: Sequence[Mapping[str, Any]]) -> list[float]:
+        """Return the losses; what was evaluated before is not evaluated again."""
+        known = {_key(self._params(t)): t.values[0] for t in self._complete()}
+        new = {_key(c): c for c in candidates if _key(c) not in known}
+        found = evaluate_candidates(self.problem, self.job.space, self.job.fixed, [*new.values()])
+        known |= {key: float(one.losses) for key, one in zip(new, found, strict=True)}
+        return [known[_key(candidate)] for candidate in candidates]
+
+    def _tell(self, trial: Trial, loss: float) -> FrozenTrial:
+        if not math.isfinite(loss):
+            return self.study.tell(trial, state=TrialState.FAIL)
+        cost = cost_at(self.problem.blur, self._params(trial)).relative
+        return self.study.tell(trial, [loss, cost])
+
+    def _importances(self) -> dict[str, float]:
+        """Return the share of each parameter in the spread of the objective alone."""
+        trials = self._complete()
+        if len(trials) < _ENOUGH:
+            return {}
+        alone = new_study()
+        for trial in trials:
+            alone.add_trial(
+                create_trial(
+                    value=trial.values[0], params=trial.params, distributions=trial.distributions
+                )
+            )
+        try:
+            return dict(optuna.importance.get_param_importances(alone))
+        except (RuntimeError, ValueError):
+            return {}  # all trials alike: nothing to divide the spread of
+
+
+def _population(method: ParetoMethod) -> int:
+    return method.population or (_POPULATION if method.sampler == "nsga2" else 1)
+
+
+def _sampler(method: ParetoMethod, seed: int) -> BaseSampler:
+    seed %= 1 << 31
+    if method.sampler == "nsga2":
+        return NSGAIISampler(population_size=_population(method), seed=seed)
+    return TPESampler(seed=seed, constant_liar=True)
+
+
+def _key(params: Mapping[str, Any]) -> tuple[tuple[str, Any], ...]:
+    return tuple(sorted(params.items()))
+
+
+def _log(folder: RunFolder, job: ParetoJob, trial: FrozenTrial) -> None:
+    known = trial.state == TrialState.COMPLETE
+    folder.log(
+        method=job.index,
+        kind="pareto",
+        step=trial.number,
+        loss=[trial.values[0] if known else None],
+        cost=trial.values[1] if known else None,
+        params={name: [value] for name, value in trial.params.items()},
+    )
+
+
+# -- given points ----------------------------------------------------------------------------------
+
+
+def _sweep(problem: Problem, job: ParetoJob) -> list[dict[str, Any]]:
+    """Return the last given point with other values of the parameter that costs the most.
+
+    So the search begins at what one would have without it: the same settings with fewer taps.
+    """
+    start = dict(job.first[-1])
+    most: list[Any] = []
+    chosen, widest = "", 1.0
+    for parameter in job.space.parameters:
+        if parameter.is_continuous or job.method.sweep == 0:
+            continue
+        values = _spaced(parameter, job.method.sweep)
+        costs = [cost_at(problem.blur, start | {parameter.name: v}).relative for v in values]
+        if max(costs) / min(costs) > widest:
+            chosen, widest, most = parameter.name, max(costs) / min(costs), values
+    return [start | {chosen: value} for value in most if value != start[chosen]]
+
+
+def _spaced(parameter: FreeParameter, count: int) -> list[Any]:
+    """Return values over the range of a parameter, in equal ratios if its scale says so."""
+    if parameter.choices:
+        return list(parameter.choices)
+    low, high = math.ceil(parameter.spec.bounds[0]), math.floor(parameter.spec.bounds[1])
+    shares = [index / max(count - 1, 1) for index in range(count)]
+    if parameter.spec.scale == "log":
+        return list(dict.fromkeys(round(low * (high / low) ** share) for share in shares))
+    return list(dict.fromkeys(round(low + (high - low) * share) for share in shares))
+
+
+# -- polish ----------------------------------------------------------------------------------------
+
+
+def _polished(
+    search: _Search, folder: RunFolder | None, progress: Progress | None
+) -> list[ParetoPoint]:
+    """Go down the gradient from each picked point: its cost stays, its objective falls.
+
+    Returns:
+        Those that became better.
+    """
+    job, points = search.job, search.points()
+    if not points:
+        raise FitError(f"{job.name}: none of {search.drawn} trials has a finite loss")
+    smooth = tuple(p.name for p in job.space.parameters if p.spec.grad == "smooth")
+    if job.method.polish is None or not smooth:
+        return []
+    by_number = {point.number: point for point in points}
+    picks = dict.fromkeys(p.number for p in pick(points, job.method.budgets))
+    chosen = [by_number[number] for number in picks if number is not None]
+    stage = Stage(f"{job.name}: polish", len(chosen), progress)
+    name = f"polished-{job.index}.pt"
+    stored = None if folder is None else folder.load_state(name)
+    if stored is None:
+        stored = {"found": [_plain(after) for after in _steps(search, chosen, smooth)]}
+        if folder is not None:
+            folder.save_state(name, stored)
+    stage.step(len(chosen), best=min((loss for _, loss in stored["found"]), default=None))
+    made = []
+    for place, (point, (params, loss)) in enumerate(zip(chosen, stored["found"], strict=True)):
+        if params is not None and loss < point.objective:
+            cost = cost_at(search.problem.blur, params)
+            made.append(make_point(search.drawn + place, "polished", params, loss, cost))
+    return made
+
+
+def _steps(
+    search: _Search, chosen: Sequence[ParetoPoint], smooth: tuple[str, ...]
+) -> list[Polished]:
+    job, spec = search.job, search.job.method.polish
+    assert spec is not None
+    starts = [
+        PolishStart(p.params, seed_of(job.seed, job.index, p.number, _POLISH_SEED)) for p in chosen
+    ]
+    task = partial(polish, spec, job.space.subset(smooth), job.fixed)
+    return search.problem.map(task, starts)
+
+
+def _plain(after: Polished) -> tuple[dict[str, Any] | None, float]:
+    return None if after.params is None else dict(after.params), after.loss
