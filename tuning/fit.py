@@ -2,20 +2,25 @@
 
 from __future__ import annotations
 
+import dataclasses
 import importlib.metadata
 import platform
 import shlex
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from torchblur.filters import BlurFilter, get_filter
 from torchblur.presets import Preset, save_preset
 from tuning.cases import AnyCase, SequenceCase
+from tuning.cluster import Cluster, ClusterError
+from tuning.cluster_problem import ClusterProblem
 from tuning.config import GradientMethod, TuneConfig, resolve
+from tuning.distributed import is_restarted, join_ranks
 from tuning.evaluation import ceiling, score_cases, score_variant
 from tuning.methods import run_methods
 from tuning.preparation import fit_device, prepare
@@ -63,12 +68,15 @@ def run_fit(
     progress: Progress | None = None,
     *,
     overwrite: bool = False,
+    cluster: Cluster | None = None,
 ) -> FitResult:
     """Fit a filter's free parameters to references and write a run folder.
 
     The folder gets `config.yaml` (resolved), `log.jsonl` (a line per step and trial), checkpoints
     and Optuna journals, `preset.yaml` (what `torchblur filter` takes), `result.json` and
     `report.html`. The best method is chosen on the training frames; the hold-out is only scored.
+
+    In processes that torchrun started the windows are split between them; the first one writes.
 
     Args:
         config: The configuration.
@@ -77,6 +85,8 @@ def run_fit(
             would have ended: bit-equal on one machine with the CPU.
         progress: Called after each step.
         overwrite: Remove a run that is there.
+        cluster: Workers for what a search draws together (`population`); they build the objective
+            from the configuration, and find the same as one process.
 
     Returns:
         All figures; `FitResult.load` reads the same from `result.json`.
@@ -85,22 +95,47 @@ def run_fit(
         ConfigError: a mistake in the configuration.
         FitError: no parameter set gives a finite loss.
         OutputError: the folder exists, or cannot be written to.
+        ClusterError: workers or other processes that are not there, or lack the data.
         TorchblurError: data that is missing or cannot be read.
     """
-    config = resolve(config)
+    config, path = resolve(config), Path(output_dir)
+    with join_ranks(config.device) as ranks:
+        if ranks is None:
+            with open_run(path, config, resume=resume, overwrite=overwrite) as folder:
+                return _fit(config, folder, progress, cluster and partial(ClusterProblem, cluster))
+        if cluster is not None:
+            raise ClusterError("a fit goes to torchrun's processes or to a Dask cluster, not both")
+        if ranks.rank > 0:
+            return ranks.follow()
+        again = is_restarted()
+        fresh = overwrite and not again
+        with open_run(path, config, resume=resume or again, overwrite=fresh) as folder:
+            result = _fit(config, folder, progress, ranks.share)
+        ranks.dismiss(result)
+        return result
+
+
+def _fit(
+    config: TuneConfig,
+    folder: RunFolder,
+    progress: Progress | None,
+    spread: Callable[[TuneConfig, Problem], Problem] | None,
+) -> FitResult:
     began = time.monotonic()
-    with open_run(Path(output_dir), config, resume=resume, overwrite=overwrite) as folder:
-        finished = folder.path / "result.json"
-        if finished.is_file() and (folder.path / "report.html").is_file():
-            return FitResult.load(finished)
-        setting = _prepare(config, folder, progress)
-        methods = run_methods(config, setting.problem, setting.space, folder, progress)
-        result, variants = _evaluate(setting, methods, began)
-        _write_preset(setting, result)
-        folder.write("result.json", result.model_dump_json(indent=2))
-        stage = Stage("report", 1, progress)
-        write_report(folder, config, result, setting.cases, variants)
-        stage.step(1)
+    finished = folder.path / "result.json"
+    if finished.is_file() and (folder.path / "report.html").is_file():
+        return FitResult.load(finished)
+    setting = _prepare(config, folder, progress)
+    if spread is not None:
+        problem = spread(config, setting.problem)
+        setting = dataclasses.replace(setting, problem=problem)
+    methods = run_methods(config, setting.problem, setting.space, folder, progress)
+    result, variants = _evaluate(setting, methods, began)
+    _write_preset(setting, result)
+    folder.write("result.json", result.model_dump_json(indent=2))
+    stage = Stage("report", 1, progress)
+    write_report(folder, config, result, setting.cases, variants)
+    stage.step(1)
     return result
 
 
