@@ -16,9 +16,12 @@ from typing import Annotated, Any
 import typer
 from typer.core import TyperGroup
 
+from tuning.bench_command import bench
 from tuning.console import metrics_table, print_error, print_warning, results, show_progress
 from tuning.evidence_commands import ablate, study
-from tuning.options import ConventionName, Overwrite, Set
+from tuning.options import ConventionName, NoCompile, Overwrite, Set
+from tuning.race_command import race
+from tuning.render_command import render
 
 __all__ = ["app"]
 
@@ -133,6 +136,7 @@ def tune(
     device: Annotated[
         str | None, typer.Option(metavar="NAME", help="auto, cpu, cuda, cuda:1 …")
     ] = None,
+    no_compile: NoCompile = False,
 ) -> None:
     """Fit a filter's parameters to reference renders.
 
@@ -144,6 +148,7 @@ def tune(
     from tuning.printing import print_fit
 
     overrides = [*(set_ or []), *([f"device={device}"] if device else [])]
+    overrides += ["engine=eager"] if no_compile else []
     folder = output or Path("runs") / config.stem
     loaded = load_tune_config(config, overrides)
     try:
@@ -187,13 +192,13 @@ def filter_(  # noqa: PLR0913 - each argument is an option
     ] = None,
     convention: ConventionName = "auto",
     overwrite: Overwrite = False,
+    no_compile: NoCompile = False,
 ) -> None:
     """Blur frames that a renderer wrote.
 
     Keys for --set are the filter's parameters (`torchblur params FILTER` lists them), shutter
     among them, and: layers=[NAME, ...] to write more than color, overrides.FIELD for what differs
-    from the convention (velocity_scale, velocity_y, depth ...), on_invalid=mask, half, engine,
-    device.
+    from the convention (velocity_scale, velocity_y ...), on_invalid=mask, half, engine, device.
     """
     from tuning.filtering import filter_files, load_settings, plan_files
 
@@ -224,6 +229,7 @@ def batch(
     workers: Annotated[
         int | None, typer.Option(metavar="N", help="Frames that are filtered at a time.")
     ] = None,
+    no_compile: NoCompile = False,
 ) -> None:
     """Filter many frames; what is done is skipped, so a stopped run goes on when started again."""
     from tuning.batch import load_batch_config, plan_batch, run_batch
@@ -243,63 +249,7 @@ def batch(
     raise typer.Exit(_FAILED if result.failures else 0)
 
 
-@app.command()
-def render(  # noqa: PLR0913 - each argument is an option
-    scene: Annotated[
-        str, typer.Argument(metavar="SCENE", help="Scene file, or a name in configs/scenes.")
-    ],
-    output: Annotated[
-        Path, typer.Option("-o", "--output", metavar="DIR", help="Folder for the files.")
-    ],
-    size: Annotated[str, typer.Option(metavar="WxH", help="Size in px.")] = "640x360",
-    spp: Annotated[int, typer.Option(metavar="N", help="Samples per pixel of references.")] = 256,
-    frames: Annotated[int, typer.Option(metavar="N", help="Number of frames.")] = 1,
-    shutter: Annotated[
-        float, typer.Option(metavar="S", help="Open time as a fraction of a frame.")
-    ] = 0.5,
-    seed: Annotated[int, typer.Option(metavar="N", help="Seed of the random samples.")] = 0,
-    start: Annotated[float, typer.Option(metavar="T", help="Time of the first frame.")] = 0.0,
-    stream: Annotated[
-        bool, typer.Option("--stream", help="Also stream.####.exr: each pixel at a random time.")
-    ] = False,
-    stream_spp: Annotated[
-        int | None, typer.Option(metavar="N", help="Samples per pixel of the stream. Default: 1.")
-    ] = None,
-    point_sampled: Annotated[
-        bool,
-        typer.Option(
-            "--point-sampled",
-            help="Also reference_pointsampled.####.exr: what the stream converges to.",
-        ),
-    ] = False,
-    overwrite: Overwrite = False,
-) -> None:
-    """Render a procedural scene: sharp frames with all layers, and references beside them.
-
-    Files that are done are kept, so a stopped run goes on when started again. Several samples per
-    pixel of a stream are files of their own: stream01.####.exr, stream02.####.exr …
-    """
-    from tuning.rendering import find_scene, render_sequence, settings_of
-
-    settings = settings_of(
-        size,
-        spp=spp,
-        frames=frames,
-        start=start,
-        shutter=shutter,
-        seed=seed,
-        stream_spp=(1 if stream else 0) if stream_spp is None else stream_spp,
-        point_sampled=point_sampled,
-    )
-    try:
-        with show_progress() as progress:
-            files = render_sequence(
-                find_scene(scene), output, settings, overwrite=overwrite, progress=progress
-            )
-    except KeyboardInterrupt as error:
-        print_error("stopped (Ctrl-C); the same command goes on")
-        raise typer.Exit(_INTERRUPTED) from error
-    results.print(f"{len(files)} files in {output}: {files[0].name} to {files[-1].name}")
+app.command()(render)
 
 
 @app.command()
@@ -350,6 +300,8 @@ def compare(
 
 app.command()(ablate)
 app.command()(study)
+app.command()(race)
+app.command()(bench)
 
 
 @app.command()
