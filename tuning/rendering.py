@@ -21,7 +21,7 @@ from tuning.progress import Progress, Stage
 
 __all__ = ["RenderSettings", "find_scene", "render_sequence", "settings_of"]
 
-_PLACES = (Path("configs/scenes"), Path(__file__).resolve().parents[1] / "configs/scenes")
+_ROOTS = (Path(), Path(__file__).resolve().parents[1])
 
 
 class RenderSettings(Config):
@@ -69,17 +69,18 @@ def settings_of(size: str, **values: Any) -> RenderSettings:
 
 
 def find_scene(scene: str) -> Path:
-    """Return the file of a scene.
+    """Return the file of a scene, or of a family of scenes.
 
     Args:
-        scene: A path, or the name of a scene in `configs/scenes`.
+        scene: A path, or a name in `configs/scenes` or `configs/families`.
 
     Raises:
         ConfigError: there is none; names the nearest.
     """
     if Path(scene).is_file():
         return Path(scene)
-    known = {path.stem: path for place in _PLACES for path in sorted(place.glob("*.yaml"))}
+    places = [root / "configs" / kind for root in _ROOTS for kind in ("families", "scenes")]
+    known = {path.stem: path for place in places for path in sorted(place.glob("*.yaml"))}
     if scene not in known:
         hint = nearest_name(scene, known)
         names = f"; scenes: {', '.join(sorted(known))}" if known else ""
