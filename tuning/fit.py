@@ -22,7 +22,10 @@ from tuning.cluster_problem import ClusterProblem
 from tuning.config import GradientMethod, TuneConfig, resolve
 from tuning.distributed import is_restarted, join_ranks
 from tuning.evaluation import ceiling, score_cases, score_variant
+from tuning.evidence import evidence_of
 from tuning.methods import run_methods
+from tuning.pareto_files import write_pareto
+from tuning.pareto_scores import budget_notes, judged
 from tuning.preparation import fit_device, prepare
 from tuning.problem import Problem
 from tuning.progress import Progress, ProgressEvent, Stage
@@ -34,17 +37,6 @@ from tuning.space import Space
 from tuning.variants import Variant
 
 __all__ = ["run_fit"]
-
-_HEADLINE = (
-    "flip",
-    "psnr",
-    "ssim",
-    "flip_band",
-    "psnr_band",
-    "ssim_band",
-    "flip_median",
-    "temporal",
-)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -169,6 +161,7 @@ def _evaluate(
     best = min(methods, key=lambda method: method.objective)
     improved = best.objective < start_objective
     tuned = best.params if improved else start
+    methods = [judged(m, setting.problem, start, setting.cases, setting.progress) for m in methods]
     variants = _variants(setting, methods, tuned)
     stage = Stage("evaluation", len(setting.cases), setting.progress)
     scores = score_cases(setting.cases, variants, stage) + _ceiling_scores(setting, tuned)
@@ -185,7 +178,7 @@ def _evaluate(
         parameters=_parameters(setting.space, tuned, slopes),
         methods=tuple(methods),
         scores=tuple(scores),
-        notes=setting.notes,
+        notes=setting.notes + budget_notes(methods),
         seed=setting.config.seed,
         command=shlex.join([Path(sys.argv[0]).name, *sys.argv[1:]]),
         versions=_versions(),
@@ -213,6 +206,11 @@ def _variants(
         variants.append(Variant(name="start", blur=blur, values=start, free=free))
     if len(methods) > 1:
         variants += [Variant(name=m.name, blur=blur, values=m.params, free=free) for m in methods]
+    for found in [method.pareto for method in methods if method.pareto is not None]:
+        variants += [
+            Variant(name=name, blur=blur, values=point.params, free=free)
+            for name, point in found.picked().items()
+        ]
     return [*variants, Variant(name="tuned", blur=blur, values=tuned, free=free)]
 
 
@@ -286,32 +284,22 @@ def _not_default(blur: BlurFilter, params: dict[str, Any]) -> dict[str, Any]:
 
 def _write_preset(setting: _Setting, result: FitResult) -> None:
     config = setting.config
-    figures: dict[str, Any] = {
-        split: {
-            variant: {m: v for m in _HEADLINE if (v := result.mean(variant, split, m)) is not None}
-            for variant in ("default", "tuned")
-        }
-        for split in ("train", "holdout")
-        if any(case.split == split for case in setting.cases)
-    }
-    evidence = {
-        "train": [case.name for case in setting.cases if case.split == "train"],
-        "holdout": [case.name for case in setting.cases if case.split == "holdout"],
-        "objective": config.objective.model_dump(mode="json"),
-        "objective_before": result.start_objective,
-        "objective_after": result.objective,
-        "method": result.chosen,
-        "figures": figures,
-        "seed": result.seed,
-        "command": result.command,
-        "versions": result.versions,
-    }
+    evidence = evidence_of(
+        result,
+        config.objective,
+        setting.cases,
+        ("default", "tuned"),
+        objective_before=result.start_objective,
+        objective_after=result.objective,
+        method=result.chosen,
+    )
     comment = (
         f"{result.filter}, tuned by torchblur; report.html beside this file has the evidence.\n"
         "Use it: torchblur filter preset.yaml INPUT.exr -o OUTPUT.exr"
     )
     preset = Preset(filter=result.filter, params=result.params, evidence=evidence)
     save_preset(setting.folder.path / "preset.yaml", preset, comment=comment, overwrite=True)
+    write_pareto(setting.folder, config, result, setting.cases, _common_shutter(setting))
 
 
 def _versions() -> dict[str, str]:

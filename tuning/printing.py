@@ -29,6 +29,7 @@ from tuning.console import (
     results,
 )
 from tuning.outputs import State
+from tuning.pareto_report import preset_names
 from tuning.result import FitResult
 
 __all__ = [
@@ -230,8 +231,10 @@ def print_batch(plan: Plan, result: BatchResult) -> None:
 
 def print_fit(result: FitResult, folder: Path) -> None:
     """Print a fit's figures on training frames and hold-out, its parameters, and its files."""
+    presets = preset_names(result)
     for split, title in (("train", "training frames"), ("holdout", "hold-out")):
-        rows = {name: _means(result, name, split) for name in _SHOWN if name in result.variants()}
+        shown = (*_SHOWN[:-3], *presets, *_SHOWN[-3:])
+        rows = {name: _means(result, name, split) for name in shown if name in result.variants()}
         rows = {name: row for name, row in rows.items() if row["flip"] == row["flip"]}
         if rows:
             results.print(metrics_table(title, rows, highlight="tuned", unranked=_BOUNDS))
@@ -243,6 +246,9 @@ def print_fit(result: FitResult, folder: Path) -> None:
     for note in result.notes:
         log(f"note: {note}")
     results.print(f"preset: {folder / 'preset.yaml'}", soft_wrap=True)
+    if presets:
+        names = ", ".join(f"{name}.yaml" for name in presets)
+        results.print(f"presets by cost: {folder / 'presets'}: {names}", soft_wrap=True)
     results.print(f"report: {folder / 'report.html'}", soft_wrap=True)
 
 

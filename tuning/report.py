@@ -15,6 +15,7 @@ from torchblur.params import Param
 from tuning.cases import AnyCase, SequenceCase
 from tuning.config import TuneConfig
 from tuning.page import Column, Row, Table, View, make_view, render_page
+from tuning.pareto_report import front_section, preset_names
 from tuning.plots import loss_curves, parameter_paths
 from tuning.result import FitResult, MethodResult, ParameterResult
 from tuning.runfolder import RunFolder
@@ -87,12 +88,13 @@ def write_report(
         result: The run's result.
         cases: Frames and sequences of both splits; of a sequence the middle one of its scored
             frames is shown, and the curves over all of them.
-        variants: What was scored; sharp, input, line, default and tuned are shown.
+        variants: What was scored; sharp, input, line, default, presets and tuned are shown.
 
     Returns:
         Where it lies.
     """
-    shown = [v for v in variants if v.name in _CURVES]
+    order = _order(result)
+    shown = sorted([v for v in variants if v.name in order], key=lambda v: order.index(v.name))
     # Hold-out first: these are the frames that say something.
     ordered = sorted(cases, key=lambda case: case.split != "holdout")
     views = [_view(i, case, shown) for i, case in enumerate(ordered[:_MAX_VIEWS])]
@@ -106,6 +108,7 @@ def write_report(
         notes=result.notes,
         tables=[t for split in ("holdout", "train") if (t := figures_table(result, split))],
         explanations=[text for n, text in _EXPLAINED.items() if n in result.variants()],
+        front=front_section(result),
         views=views,
         left_out=len(ordered) - len(views),
         curves=_curves(ordered[:_MAX_VIEWS], result),
@@ -193,11 +196,16 @@ def _count(number: int, name: str) -> str:
     return f"{number} {name}{'' if number == 1 else 's'}" if number else ""
 
 
+def _order(result: FitResult) -> tuple[str, ...]:
+    """Return the images that are shown, in order; presets from cheap to dear."""
+    return (*_CURVES[:1], *preset_names(result), *_CURVES[1:])
+
+
 # -- sections --------------------------------------------------------------------------------------
 
 
 def _view(index: int, case: AnyCase, variants: Sequence[Variant]) -> View:
-    chosen = sorted((v for v in variants if v.fits(case)), key=lambda v: _CURVES.index(v.name))
+    chosen = [v for v in variants if v.fits(case)]
     title = case.name
     if isinstance(case, SequenceCase):
         middle = (case.warm_up + len(case)) // 2
