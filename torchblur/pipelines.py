@@ -17,7 +17,7 @@ from pydantic import field_validator
 
 from torchblur.errors import ConfigError
 from torchblur.io.yaml import load_yaml
-from torchblur.ops.gather import Engine
+from torchblur.ops.compiling import EngineChoice
 from torchblur.params import build
 from torchblur.post.pipeline import FramePipeline, PipelineConfig
 from torchblur.presets import Preset, create_filter
@@ -38,14 +38,14 @@ class FrameConfig(PipelineConfig):
 
 
 def create_pipeline(
-    config: FrameConfig | Mapping[str, Any] | str | Path, *, engine: Engine = "eager"
+    config: FrameConfig | Mapping[str, Any] | str | Path, *, engine: EngineChoice = "auto"
 ) -> FramePipeline:
     """Make the pipeline of a frame from its config.
 
     Args:
         config: The config, its data, or the path of a YAML file. Paths of presets in a file are
             relative to the file.
-        engine: "eager", or "compiled" to compile the tap functions of the blur.
+        engine: Of the blur: "auto", "eager" or "compiled"; see `BlurFilter`.
 
     Returns:
         A Module: ``pipeline(frame) -> (B, 3, H, W)``.

@@ -17,7 +17,7 @@ from pydantic import Field
 from torchblur.errors import ConfigError
 from torchblur.filters import BlurFilter, get_filter, registered_filters
 from torchblur.io.yaml import load_yaml, save_yaml
-from torchblur.ops.gather import Engine
+from torchblur.ops.compiling import EngineChoice
 from torchblur.params import Config, build
 
 __all__ = ["Preset", "create_filter", "load_preset", "save_preset"]
@@ -71,13 +71,13 @@ def save_preset(
 
 
 def create_filter(
-    name_or_preset: str | Path, *, engine: Engine = "eager", **params: Any
+    name_or_preset: str | Path, *, engine: EngineChoice = "auto", **params: Any
 ) -> BlurFilter:
     """Make a filter from its name or from a preset file.
 
     Args:
         name_or_preset: A registered name ("guertin2014"), or the path of a preset.
-        engine: "eager", or "compiled" to compile the tap function.
+        engine: "auto", "eager" or "compiled"; see `BlurFilter`.
         **params: Single parameters over the preset's: ``num_samples=15, kappa=30.0``.
 
     Returns:

@@ -15,7 +15,7 @@ from torchblur.filters import BlurFilter
 from torchblur.filters.base import History, TemporalBlur
 from torchblur.frame import Frame
 from torchblur.io import ConventionOverrides, get_convention, read_frame
-from torchblur.ops.gather import Engine
+from torchblur.ops.compiling import EngineChoice
 from torchblur.params import Config
 from torchblur.presets import create_filter
 from tuning.images import write_color
@@ -63,7 +63,9 @@ class FilterSettings(Config):
         "memory: stream02.####.exr",
     )
     half: bool = Field(True, description="write color as 16-bit float")
-    engine: Engine = Field("eager", description="eager, or compiled taps")
+    engine: EngineChoice = Field(
+        "auto", description="eager, compiled, or auto: compiled if there is so much to do"
+    )
     device: str = Field("auto", description="auto, cpu, cuda, cuda:1 …")
 
 

@@ -16,7 +16,7 @@ from pydantic import Field, create_model, field_validator
 from torchblur.errors import ConfigError, nearest_name
 from torchblur.filters import get_filter, registered_filters
 from torchblur.io import load_yaml
-from torchblur.ops.gather import Engine
+from torchblur.ops.compiling import EngineChoice
 from torchblur.params import Config, build, choices, declared
 from torchblur.presets import load_preset
 from tuning.cost_checks import check_costs
@@ -91,7 +91,9 @@ class TuneConfig(Config):
     )
     seed: int = Field(0, ge=0, description="of starts, windows, batches and samplers")
     device: str = Field("auto", description="auto, cpu, cuda, cuda:1 …")
-    engine: Engine = Field("eager", description="eager, or compiled taps")
+    engine: EngineChoice = Field(
+        "auto", description="eager, compiled, or auto: compiled if there is so much to do"
+    )
 
 
 def load_tune_config(path: str | Path, overrides: Sequence[str] = ()) -> TuneConfig:

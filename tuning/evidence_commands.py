@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from tuning.console import print_error, results, show_progress
-from tuning.options import Overwrite, Set
+from tuning.options import NoCompile, Overwrite, Set
 
 __all__ = ["ablate", "study"]
 
@@ -28,6 +28,7 @@ def ablate(
     ] = None,
     set_: Set = None,
     overwrite: Overwrite = False,
+    no_compile: NoCompile = False,
 ) -> None:
     """Measure claims: a filter with a feature off and on, against references of their scenes.
 
@@ -58,6 +59,7 @@ def study(
     ] = None,
     set_: Set = None,
     overwrite: Overwrite = False,
+    no_compile: NoCompile = False,
 ) -> None:
     """Measure filters frame by frame, on scenes and on files, beside raw samples.
 

@@ -24,6 +24,7 @@ from tuning.apply import (
     write_job,
 )
 from tuning.config import apply_overrides
+from tuning.engine import files_engine
 from tuning.images import read_color
 from tuning.judging import Scores, SequenceJudge, asked_name, judge, mean_scores
 from tuning.outputs import Job, find_inputs, make_folders, name_outputs, numbered
@@ -138,6 +139,7 @@ def filter_files(
         TorchblurError: the first file that cannot be read, filtered or written.
     """
     blur = make_filter(settings)
+    blur.engine = files_engine(blur, [_named(job, settings) for job in jobs])
     stage = Stage(blur.name, len(jobs), progress if len(jobs) > 1 else None)
     stage.step(0)
     scores: list[dict[str, dict[str, float]]] = []
@@ -166,8 +168,7 @@ def _filter_shot(
     sequence = SequenceJudge(blur)
     recipe = recipe_of(settings, blur, shot[0].gbuffer is not None)
     for job in shot:
-        more = samples_beside(job.source, settings)
-        named = Job(job.source, job.output or job.source, job.gbuffer, more)
+        named = _named(job, settings)
         samples = read_samples(named, settings)
         if isinstance(blur, TemporalBlur):
             color, layers, history = blur_step(blur, samples, history, settings.layers)
@@ -191,6 +192,11 @@ def _filter_shot(
                 overwrite=overwrite,
             )
         yield job, scores
+
+
+def _named(job: FileJob, settings: FilterSettings) -> Job:
+    more = samples_beside(job.source, settings)
+    return Job(job.source, job.output or job.source, job.gbuffer, more)
 
 
 def _beside(key: str, pattern: str, source: Path, count: int) -> str:

@@ -14,6 +14,7 @@ from torchblur.filters import BlurFilter, get_filter
 from tuning.cases import AnyCase, check_needs
 from tuning.config import TuneConfig
 from tuning.data import load_cases
+from tuning.engine import fit_engine
 from tuning.problem import Problem
 from tuning.space import Space, make_space
 from tuning.windows import AnySample, Sample, make_samples
@@ -73,6 +74,7 @@ def prepare(config: TuneConfig, report: Callable[[int, int, str], None] | None =
     for parameter in blur.parameters():
         parameter.requires_grad_(False)
     problem = Problem(blur, samples, config.objective, space.names)
+    blur.engine = fit_engine(config, problem, space)
     return Prepared(space=space, blur=blur, cases=cases, problem=problem, notes=notes)
 
 

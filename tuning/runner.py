@@ -20,6 +20,7 @@ from torch import Tensor
 from torchblur.filters import BlurFilter
 from torchblur.filters.base import History, TemporalBlur
 from torchblur.frame import Frame
+from torchblur.ops.compiling import compiler_works
 from tuning.apply import FilterSettings, blur_frame, blur_step, read_samples, write_job
 from tuning.outputs import Job
 
@@ -80,7 +81,8 @@ class Runner:
         self._workers, self._prefetch, self._log = workers, prefetch, log
         self._stopping, self._dropped = threading.Event(), threading.Event()
         # torch.compile is not made for several threads: they take turns, with all cores each.
-        self._turn = threading.Lock() if settings.engine == "compiled" else None
+        is_compiled = blur.engine == "compiled" and compiler_works()
+        self._turn = threading.Lock() if is_compiled else None
         self._readers: ThreadPoolExecutor
 
     def run(self, tasks: Iterable[Task]) -> bool:

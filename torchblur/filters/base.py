@@ -7,6 +7,8 @@ function of a frame and the parameters' values, and a `BlurFilter` that holds th
 
 from __future__ import annotations
 
+import copy
+import math
 from collections import abc
 from dataclasses import dataclass
 from typing import Annotated, Any, ClassVar
@@ -16,6 +18,7 @@ from torch import Tensor
 from torchblur.configured import ConfiguredModule, Values, batch_size_of
 from torchblur.errors import ConfigError, nearest_name
 from torchblur.frame import LONGEST_SHUTTER, Frame, Sequence, Shutter, ShutterPosition
+from torchblur.ops.compiling import EngineChoice, compiler_works, worth_compiling
 from torchblur.ops.gather import Engine
 from torchblur.params import Config, Param
 
@@ -29,6 +32,7 @@ __all__ = [
     "registered_filters",
 ]
 
+_TAPS = 16  # of a filter that does not say how many it has
 _REGISTRY: dict[str, type[BlurFilter]] = {}
 
 
@@ -67,7 +71,8 @@ class BlurFilter(ConfiguredModule):
 
     Args:
         config: The parameters; the paper's if left out.
-        engine: "eager", or "compiled" to compile the tap function (once, on the first call).
+        engine: "eager"; "compiled" to compile the tap function (once per structure, on the first
+            call); or "auto": compiled for a `sequence` that is worth it, eager else.
         **params: Single parameters by name, over those of `config`.
 
     Raises:
@@ -85,10 +90,19 @@ class BlurFilter(ConfiguredModule):
             _REGISTRY[cls.name] = cls
 
     def __init__(
-        self, config: FilterConfig | None = None, *, engine: Engine = "eager", **params: Any
+        self, config: FilterConfig | None = None, *, engine: EngineChoice = "auto", **params: Any
     ) -> None:
         super().__init__(config, **params)
-        self.engine: Engine = engine
+        self._engine: EngineChoice = engine
+
+    @property
+    def engine(self) -> Engine:
+        """The engine of a call: "eager" if it is "auto"."""
+        return "eager" if self._engine == "auto" else self._engine
+
+    @engine.setter
+    def engine(self, engine: EngineChoice) -> None:
+        self._engine = engine
 
     @property
     def shutter_setting(self) -> Shutter:
@@ -110,6 +124,21 @@ class BlurFilter(ConfiguredModule):
         if batch_size != frame.batch_size:
             frame = frame.expand(batch_size)
         return self.compute(frame, values)
+
+    def engine_for(self, pixels: float) -> Engine:
+        """Return the engine that suits an amount of work; the given one unless it is "auto".
+
+        Without a C++ compiler that is "eager", with one notice if compiling would be worth it.
+
+        Args:
+            pixels: Of all calls together; one with its gradient counts `GRADIENT_CALLS` times.
+        """
+        if self._engine != "auto":
+            return self._engine
+        tensors = [*self.parameters(), *self.buffers()]
+        device = tensors[0].device if tensors else "cpu"
+        work = pixels * getattr(self.config, "num_samples", _TAPS)
+        return "compiled" if worth_compiling(work, device) and compiler_works() else "eager"
 
     def compute(self, frame: Frame, values: Values) -> dict[str, Tensor]:
         """Call the filter's function; each filter says how."""
@@ -214,12 +243,14 @@ class TemporalBlur(BlurFilter):
         """
         if detach_every is not None and detach_every < 1:
             raise ConfigError(f"`detach_every` must be at least 1 frame, got {detach_every}")
+        blur = copy.copy(self)  # shares all parameters
+        blur.engine = self.engine_for(sum(f.batch_size * math.prod(f.size) for f in sequence))
         history: History | None = None
         colors = []
         for index, frame in enumerate(sequence):
             if index in sequence.cuts:
                 history = None
-            color, history = self(frame, history, **overrides)
+            color, history = blur(frame, history, **overrides)
             if detach_every is not None and (index + 1) % detach_every == 0:
                 history = history.detach()
             colors.append(color)

@@ -28,6 +28,7 @@ __all__ = [
     "Window",
     "read_exr",
     "read_metadata",
+    "read_size",
     "to_half",
     "write_exr",
 ]
@@ -146,12 +147,20 @@ def read_metadata(path: str | Path) -> dict[str, Any]:
         FileFormatError: if the file is missing, empty, a folder, no OpenEXR file or truncated, or
             its header is damaged.
     """
-    path = _whole_file(path)
-    try:
-        header = OpenEXR.File(str(path), header_only=True)
-    except Exception as error:
-        raise FileFormatError(f"{path} is damaged: {error}") from error
-    return _metadata(path, (part.header for part in header.parts))
+    return _metadata(Path(path), _headers(path))
+
+
+def read_size(path: str | Path) -> tuple[int, int]:
+    """Read height and width in px of a file's first part, without decoding the pixels.
+
+    Args:
+        path: The file.
+
+    Raises:
+        FileFormatError: as `read_metadata`.
+    """
+    window = _window(_headers(path)[0]["dataWindow"])
+    return window.height, window.width
 
 
 def write_exr(
@@ -222,6 +231,15 @@ def _whole_file(path: str | Path) -> Path:
         raise FileFormatError(f"{path} is not an OpenEXR file; it begins with {_head(path)}")
     _check_complete(path)
     return path
+
+
+def _headers(path: str | Path) -> list[Mapping[str, Any]]:
+    """Return the header of each part, without decoding the pixels."""
+    path = _whole_file(path)
+    try:
+        return [part.header for part in OpenEXR.File(str(path), header_only=True).parts]
+    except Exception as error:
+        raise FileFormatError(f"{path} is damaged: {error}") from error
 
 
 def _metadata(path: Path, headers: Iterable[Mapping[str, Any]]) -> dict[str, Any]:

@@ -15,11 +15,13 @@ import warnings
 from collections.abc import Callable
 from pathlib import Path
 from types import FunctionType
-from typing import Any
+from typing import Any, Literal
 
 import torch
 
 __all__ = [
+    "GRADIENT_CALLS",
+    "EngineChoice",
     "cache_folder",
     "compile_alone",
     "compiler_errors",
@@ -27,7 +29,15 @@ __all__ = [
     "give_up_compiling",
     "kernel_folder",
     "load_compiler",
+    "stop_compiling",
+    "worth_compiling",
 ]
+
+EngineChoice = Literal["auto", "eager", "compiled"]
+
+_WORTH_COMPILING = {"cpu": 1.5e9, "cuda": 7.5e10}  # taps of pixels; a GPU is 50 times as fast
+GRADIENT_CALLS = 4
+"""How many calls without a gradient take as long as one with it."""
 
 _CACHE_VARIABLE = "TORCHINDUCTOR_CACHE_DIR"
 
@@ -45,6 +55,21 @@ def cache_folder() -> Path:
         return Path(own)
     base = os.environ.get("XDG_CACHE_HOME")
     return (Path(base) if base else Path.home() / ".cache") / "torchblur"
+
+
+def worth_compiling(work: float, device: torch.device | str = "cpu") -> bool:
+    """Return whether an amount of work takes so long that compiling for it pays.
+
+    The first compilation takes a core some 15 s for a filter, and as long again for its gradient;
+    what is kept on disk is loaded in 3 s. An eager tap of a pixel takes 60 ns, less where many
+    pixels stand still: the limit is between 30 and 90 s of eager work. The answer does not depend
+    on what is on disk, so that the same work is always done in the same way.
+
+    Args:
+        work: Pixels times taps times calls; a call with its gradient counts `GRADIENT_CALLS`.
+        device: Where it is done.
+    """
+    return work > _WORTH_COMPILING.get(torch.device(device).type, _WORTH_COMPILING["cpu"])
 
 
 def kernel_folder() -> Path:
@@ -99,6 +124,12 @@ def give_up_compiling(error: Exception) -> None:
             _stop((str(error).splitlines() or [type(error).__name__])[0])
 
 
+def stop_compiling() -> None:
+    """Compile nothing more in this process, because that is asked for: without a notice."""
+    with _lock:
+        _state.update(works=False, looked=True)
+
+
 def compile_alone(function: Callable[..., Any], **options: Any) -> Callable[..., Any]:
     """Return a function compiled by `torch.compile`, with a count of compilations of its own.
 
@@ -118,7 +149,7 @@ def compile_alone(function: Callable[..., Any], **options: Any) -> Callable[...,
         function.__defaults__,
         function.__closure__,
     )
-    return torch.compile(own, **options)  # type: ignore[no-any-return]
+    return torch.compile(own, **options)
 
 
 def _keep_kernels() -> None:

@@ -24,6 +24,7 @@ from torchblur.filters import BlurFilter, get_filter
 from torchblur.frame import Frame
 from torchblur.params import declared
 from torchblur.testing.frames import as_stream, constant_motion, moving_square, random_frame
+from torchblur.testing.kernels import traced_kernels
 from torchblur.testing.probes import (
     box_blur,
     inside,
@@ -362,6 +363,34 @@ class FilterContract:
             results.append([image, color.grad, *used])
         for eager, compiled in zip(*results, strict=True):
             assert torch.allclose(eager, compiled, atol=1e-5, rtol=1e-4)
+
+    def test_compiled_once_per_structure(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        compiled = traced_kernels(monkeypatch)
+        frame, other = (self.given(random_frame(40, 44, seed=seed)) for seed in (1, 2))
+        blur = self.filter_class(None, engine="compiled", **self.few_taps())
+
+        def run(frame: Frame, **overrides: Any) -> int:
+            leaf = frame.color.clone().requires_grad_()
+            blur.requires_grad_(False)
+            image = self.image(blur, dataclasses.replace(frame, color=leaf), **overrides)
+            image.square().sum().backward()
+            return compiled()
+
+        sets: list[dict[str, Tensor]] = [{}, {}]
+        for name, spec in numbers(self.filter_class):
+            values = spec.from_unit(torch.tensor([0.3, 0.6, 0.7]))
+            one, two, _ = values.tolist()
+            before = run(frame, **{name: one})  # a special value may be a structure of its own
+            assert run(frame, **{name: two}) == before, name
+            for given, count in zip(sets, (2, 3), strict=True):
+                given[name] = values[:count].view(-1, 1, 1, 1)
+        before = run(frame, **sets[0])
+        assert run(frame, **sets[1]) == before
+        before = run(Frame.stack([frame, other]))
+        assert run(Frame.stack([frame, other, frame])) == before
+        assert run(self.given(random_frame(50, 60))) == before
+        blur = self.filter_class(None, engine="compiled", **(self.few_taps() | {"shutter": 0.8}))
+        assert run(frame) == before
 
     @pytest.mark.parametrize("size", [(1, 1), (1, 9), (7, 1), (13, 41)])
     def test_any_size(self, size: tuple[int, int]) -> None:
