@@ -29,7 +29,7 @@ from torchblur.ops.velocity import direction, length
 from torchblur.ops.weights import cone, cylinder, depth_weights, power, saturate
 from torchblur.params import Param
 
-__all__ = ["Guertin2014Blur", "Guertin2014Config", "guertin2014"]
+__all__ = ["Guertin2014Blur", "Guertin2014Config", "center_direction", "guertin2014"]
 
 _SETTINGS = "Guertin 2014, section 5"
 _GOLDEN = 0.6180339887498949  # spreads the taps of one direction evenly over the others
@@ -252,7 +252,7 @@ def _tap_inputs(frame: Frame, spread: Spread, dominant: Tensor, values: Values) 
     x, y = pixel_grid(frame.color)
     w_n = direction(dominant)
     length_p = torch.maximum(spread.length, values.min_length)
-    w_c = _center_direction(w_n, spread, length_p, values)
+    w_c = center_direction(w_n, spread, length_p, values)
     against_tile = power((w_c * w_n).sum(1, keepdim=True).abs(), values.direction_exponent)
     inputs = {
         "texture": texture_of(frame, spread),
@@ -294,8 +294,17 @@ def _options(values: Values) -> _Options:
     )
 
 
-def _center_direction(w_n: Tensor, spread: Spread, length_p: Tensor, values: Values) -> Tensor:
-    """Return w_c: the pixel's direction, or the perpendicular of w_n where the pixel is slow."""
+def center_direction(w_n: Tensor, spread: Spread, length_p: Tensor, values: Values) -> Tensor:
+    """Return w_c: the pixel's direction, or the perpendicular of w_n where the pixel is slow.
+
+    Args:
+        w_n: Unit vector of the tile's motion, (B, 2, H, W).
+        spread: Half spreads of the pixels.
+        length_p: Their lengths, floored, px, (B, 1, H, W).
+        values: `min_length`, `gamma` and `softness`.
+
+    Reference: Guertin 2014, eq. 1.
+    """
     w_p = torch.cat((-w_n[:, 1:], w_n[:, :1]), 1)
     against = (w_p * spread.half).sum(1, keepdim=True) < 0
     w_p = torch.where(against, -w_p, w_p)
@@ -322,7 +331,7 @@ def _tap(index: Tensor, count: Tensor, inputs: Inputs, options: _Options) -> tup
     t = (2 * (index + 1 + inputs["jitter"]) / (count + 1) - 1).clamp(-1, 1)
     d, reach, own = inputs["w_n"], inputs["reach"], inputs["own_n"]
     if options.two_directions:
-        along_center = _takes_center_direction(index, inputs, options)
+        along_center = _takescenter_direction(index, inputs, options)
         d = torch.where(along_center, inputs["w_c"], d)
         own = torch.where(along_center, inputs["own_c"], own)
         if options.own_length:
@@ -334,7 +343,7 @@ def _tap(index: Tensor, count: Tensor, inputs: Inputs, options: _Options) -> tup
     return weighted(weight, tap.color), weight if tap.valid is None else weight * tap.valid
 
 
-def _takes_center_direction(index: Tensor, inputs: Inputs, options: _Options) -> Tensor:
+def _takescenter_direction(index: Tensor, inputs: Inputs, options: _Options) -> Tensor:
     if options.by_variance:
         return torch.remainder((index + 0.5) * _GOLDEN, 1.0) < inputs["variance"]
     return torch.remainder(index, 2) == 1

@@ -1,0 +1,342 @@
+"""torchblur's own filter: the parts of the published ones, and samples that arrive on time."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from typing import Any, NamedTuple
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from torchblur.filters.base import BlurFilter, Values
+from torchblur.filters.composed_config import ComposedConfig
+from torchblur.filters.composed_gather import (
+    alternate_tap,
+    pair_tap,
+    shared_inputs,
+    tap_options,
+    time_tap,
+)
+from torchblur.filters.guertin2014 import center_direction
+from torchblur.filters.notes2025_gather import Blurred, Line, Sums, compose
+from torchblur.filters.notes2025_postfilter import post_filter
+from torchblur.filters.reconstruction import Spread, resolve
+from torchblur.filters.revealed import revealed_inputs
+from torchblur.frame import Frame, Shutter
+from torchblur.ops.directions import TileDirections, tile_directions
+from torchblur.ops.gather import Engine, Inputs, gather
+from torchblur.ops.noise import NoiseKind, noise_plane
+from torchblur.ops.tiles import (
+    neighbor_max,
+    neighbor_min,
+    tile_lookup,
+    tile_max,
+    tile_min,
+    tile_offset,
+)
+from torchblur.ops.velocity import clamp_length, direction, half_velocity, length, quantize_uint8
+from torchblur.ops.weights import power, saturate
+
+__all__ = ["ComposedBlur", "ComposedConfig", "composed"]
+
+_SHORTEST_REACH = 1e-3  # px; what is shorter has no direction either
+_LEVEL = 1e-6  # neighbors whose depths differ by less, as a share, are one surface
+
+
+def composed(frame: Frame, config: ComposedConfig | None = None, **params: Any) -> Tensor:
+    """Blur with torchblur's own filter, whose special cases are published ones.
+
+    The taps are times. At time t three samples compete for a pixel at x: those that the tile's
+    dominant motion, its second motion and the pixel's own would bring there, ``S = x − t v``. Each
+    then follows the motion that it finds there instead (`refinements`). Its match says whether
+    it arrives on time, and the nearer hide the others:
+
+    ``m = sat(1 − |V_S − v| |t| / (match_tolerance + match_slope |v t|))``,
+    ``w_k = m_k Π_j (1 − m_j f_kj)``,  ``f_kj = 1 − sat(level + (Z_j − Z_k) / extent)``.
+
+    The front's share of this time is ``c = 1 − Π (1 − m_k)``, its color ``Σ w_k C_k / Σ w_k``.
+    Where nothing arrives, a surface has left the pixel and lets the back through: the tap on the
+    pixel's own line, as far as it lies behind. With ``α = Σ c / N`` the result is
+    ``α front + (1 − α) back``, each normalized; without a back it is the front alone.
+
+    With `sampling` "alternate" and "pairs" taps have the published weights in place of matches,
+    depth × spread × direction, and `resolve` has three ways to make a color of the sums.
+    `composed_cases.special_case` gives the parameters with which this filter is another one.
+
+    Args:
+        frame: Color, depth and velocity, (B, ·, H, W).
+        config: Parameters; the defaults if left out.
+        **params: Single parameters over those of `config`.
+
+    Returns:
+        Color, scene-linear, (B, 3, H, W).
+
+    Differentiable: in color, in depth, in the velocity (through the matches and through the
+        positions of the color lookups; motion and depth are looked up at the nearest pixel), and
+        in every parameter that `torchblur params` calls smooth.
+    Border: replicated.
+    Reference: torchblur. Parts of McGuire 2012, Guertin 2014, Jimenez 2014 and the 2025 notes, as
+        each parameter says; following the motion that a tap finds is the fixed-point iteration of
+        Bowles et al. 2012 (Iterative Image Warping); `edge_motion` is known from temporal
+        anti-aliasing (Karis 2014). Not special cases: the second pass of Sousa 2013, which filters
+        a result (`TwoPassBlur` does that with any filter), half resolution of the 2025 notes, and
+        taps assigned by the variance of tiles (Guertin 2014).
+    Raises: ConfigError for a bad parameter, FrameError if the frame has no depth.
+    """
+    result: Tensor = ComposedBlur(config, **params)(frame)
+    return result
+
+
+class ComposedBlur(BlurFilter):
+    """torchblur's own filter; the published ones are sets of its parameters. See `composed`.
+
+    `layers` adds "alpha" (the front's share; with one sum the mean weight), "output_alpha" (how
+    much replaces the pixel's own color) and "weight" (the mean weight of all taps), (B, 1, H, W),
+    and "primary" and "secondary" (half spread per tile in px, (B, 2, Ty, Tx)).
+    """
+
+    name = "torchblur"
+    config_class = ComposedConfig
+
+    def compute(self, frame: Frame, values: Values) -> dict[str, Tensor]:
+        """Return "color", the alphas, "weight" and the tiles."""
+        return _layers(frame, values, self.engine)
+
+
+def _layers(frame: Frame, values: Values, engine: Engine) -> dict[str, Tensor]:
+    seen = _clean_edges(frame, values)
+    spread, tiles = _motion(seen, values)
+    offset = _tile_shift(frame.color, values)
+    first, second = (tile_lookup(t, frame.color, values.tile_size, offset) for t in tiles)
+    least = neighbor_min(tile_min(spread.length.detach(), values.tile_size))
+    least = tile_lookup(least, frame.color, values.tile_size, offset)
+    moving = length(first) > values.early_out
+    inputs = shared_inputs(seen, spread, values)
+    inputs["linear"] = (least >= values.bilinear_min).to(frame.dtype)
+    inputs["fast"] = (least >= values.fast_ratio * length(first)).to(frame.dtype)
+    inputs |= revealed_inputs(frame, values, lambda f, v: _layers(f, v, engine)["color"])
+    ways = _ways(first, second, spread, values)
+    lines = _lines(ways, inputs["linear"] > 0, moving, values)
+    sums = _gather(ways, lines, inputs, values, engine)
+    image = _resolve(frame, sums, spread, moving, values)
+    if values.post_filter:
+        image = post_filter(frame, image, list(lines.values()), values, engine)
+    layers = image._asdict() | tiles._asdict()
+    del layers["influence"]
+    return layers
+
+
+# -- motion ----------------------------------------------------------------------------------------
+
+
+def _clean_edges(frame: Frame, values: Values) -> Frame:
+    """Return the frame; beside something nearer, pixels have its motion (and its depth).
+
+    Renderers average motion over a pixel: at the edge of an object it is that of neither surface,
+    and nothing that follows it arrives.
+    """
+    depth = frame.finite_depth()
+    if values.edge_motion == "own":
+        return frame
+    depths = _around(depth)
+    nearest = depths.amin(1, keepdim=True)
+    same = (depths <= nearest * (1 + _LEVEL)).to(depth.dtype)
+    beside = depth * (1 - values.edge_depth) > nearest
+    share = same / same.sum(1, keepdim=True)
+    motion = [(_around(v) * share).sum(1, keepdim=True) for v in frame.velocity.split(1, 1)]
+    velocity = torch.where(beside, torch.cat(motion, 1), frame.velocity)
+    if values.edge_motion == "surface":
+        depth = torch.where(beside, nearest, depth)
+    return dataclasses.replace(frame, velocity=velocity, depth=depth)
+
+
+def _around(plane: Tensor) -> Tensor:
+    """Return the 3x3 values around each pixel of one plane, (B, 9, H, W)."""
+    height, width = plane.shape[-2:]
+    padded = F.pad(plane, (1, 1, 1, 1), mode="replicate")
+    shifts = [(j, i) for j in range(3) for i in range(3)]
+    return torch.cat([padded[..., j : j + height, i : i + width] for j, i in shifts], 1)
+
+
+def _motion(frame: Frame, values: Values) -> tuple[Spread, TileDirections]:
+    """Return half spreads per pixel, exactly 0 where still, and both motions per tile."""
+    size = values.tile_size
+    longest = size / (1 + abs(Shutter(1, values.shutter_position).center))
+    whole = half_velocity(frame.velocity, values.shutter)
+    half = clamp_length(whole, longest)
+    if values.velocity_encoding == "uint8":
+        whole = half = quantize_uint8(half, size)
+    if values.second_direction:
+        tiles = tile_directions(
+            whole,
+            size,
+            reduction=values.direction_reduction,
+            cull=values.neighbor_culling,
+            exponent=_per_image(values.secondary_exponent),
+        )
+    else:
+        primary = neighbor_max(tile_max(whole, size), cull=values.neighbor_culling)
+        tiles = TileDirections(primary, torch.zeros_like(primary))
+    if values.velocity_encoding != "uint8":
+        tiles = TileDirections(*(clamp_length(tile, longest) for tile in tiles))
+    if values.velocity_encoding == "tiles":
+        tiles = TileDirections(*(quantize_uint8(tile, size) for tile in tiles))
+    unit = direction(half)
+    return Spread(half, torch.where((unit == 0).all(1, True), 0.0, length(half)), unit), tiles
+
+
+def _per_image(value: Tensor) -> Tensor:
+    """Return a parameter without its dependence on the pixel, for use per tile."""
+    return value.mean((-2, -1), keepdim=True) if value.ndim == 4 else value
+
+
+def _tile_shift(color: Tensor, values: Values) -> Tensor:
+    kind: NoiseKind = "gradient" if values.noise == "checkerboard" else values.noise
+    noise = noise_plane(kind, color, 1, values.seed)
+    return tile_offset(color, noise, values.tile_size, values.tile_jitter)
+
+
+# -- taps ------------------------------------------------------------------------------------------
+
+
+class _Way(NamedTuple):
+    """One direction of taps, per pixel."""
+
+    unit: Tensor
+    reach: Tensor
+    """Half spread that the taps cover, px, (B, 1, H, W)."""
+    agrees: Tensor
+    """Weight of the pixel's own direction along it, in [0, 1], (B, 1, H, W)."""
+    vector: Tensor
+    """Half spread that a sample must have, px, (B, 2, H, W)."""
+
+
+def _ways(first: Tensor, second: Tensor, spread: Spread, values: Values) -> dict[str, _Way]:
+    """Return the directions that the parameters ask for by name; the pixel's own if by none."""
+    tile, reach = direction(first), length(first)
+    own, own_reach = spread.unit, spread.length
+    if values.center_direction == "blend":
+        own = center_direction(
+            tile, spread, torch.maximum(spread.length, values.min_length), values
+        )
+    if values.tap_length == "tile":
+        own_reach = reach
+    along = {
+        "first": (tile, reach, first),
+        "own": (own, own_reach, spread.half),
+        "second": (direction(second), length(second), second),
+    }
+    wanted = [name for name in along if vars(values)[f"{name}_direction"]] or ["own"]
+    ways = {}
+    for name in wanted:
+        unit, far, vector = along[name]
+        against = tile if values.own_direction_against == "tile" else unit
+        cosine = (own * against).sum(1, keepdim=True).abs()
+        if name == "own" and values.own_direction_against == "tap":
+            cosine = torch.ones_like(cosine)
+        ways[name] = _Way(unit, far, power(cosine, values.direction_exponent), vector)
+    return ways
+
+
+def _lines(
+    ways: dict[str, _Way], linear: Tensor, moving: Tensor, values: Values
+) -> dict[str, Line]:
+    """Return where each direction is sampled, and how densely if in pairs."""
+    pairs = (values.num_samples + 1) // 2
+    lines = {}
+    for number, (name, way) in enumerate(ways.items()):
+        plane, most, used = torch.full_like(way.reach, float(pairs)), pairs, moving
+        if number == 0 and values.double_samples and values.sampling == "pairs":
+            plane, most = torch.where(linear, plane, 2 * plane), 2 * pairs
+        if name == "second" and "first" in ways:
+            cosine = (ways["first"].unit * way.unit).sum(1, keepdim=True).abs()
+            apart = cosine < torch.cos(values.min_angle * (math.pi / 180))
+            used = moving & apart & (way.reach > values.early_out)
+        lines[name] = Line(way.unit * way.reach, used, plane, most)
+    return lines
+
+
+def _gather(
+    ways: dict[str, _Way], lines: dict[str, Line], shared: Inputs, values: Values, engine: Engine
+) -> list[Sums]:
+    """Return the means over the taps: of each line if in pairs, else of all together."""
+    options = tap_options(values, tuple(ways))
+    if values.sampling == "pairs":
+        found = []
+        for name, line in lines.items():
+            reach = ways[name].reach.clamp_min(_SHORTEST_REACH)
+            inputs = shared | ways[name]._asdict() | {"reach": reach, "pairs": line.pairs}
+            totals = gather(pair_tap, options, line.most_pairs, inputs, engine)
+            area = values.area_slope * reach if values.accurate_alpha else None
+            found.append(_means(totals, 2 * line.pairs, line, area, values))
+        return found
+    name, way = next(iter(ways.items()))
+    line = lines[name]
+    count = torch.full_like(line.pairs, float(values.num_samples))
+    inputs = dict(shared)
+    for name, one in ways.items():
+        inputs |= {f"{name}_{key}": plane for key, plane in one._asdict().items()}
+    tap = time_tap if values.sampling == "times" else alternate_tap
+    totals = gather(tap, options, values.num_samples, inputs, engine)
+    spreads = values.accurate_alpha and values.sampling == "alternate"
+    area = values.area_slope * way.reach if spreads else None
+    return [_means(totals, count, line, area, values)]
+
+
+def _means(
+    totals: tuple[Tensor, ...], count: Tensor, line: Line, area: Tensor | None, values: Values
+) -> Sums:
+    *sums, alpha = (total / count for total in totals)
+    if area is not None:
+        alpha = alpha * (1 + area)
+    alpha = saturate(values.alpha_gain * alpha, values.softness)
+    used = line.used.to(alpha.dtype)
+    return Sums(*(plane * used for plane in (*sums, alpha)), torch.zeros_like(alpha))
+
+
+# -- color -----------------------------------------------------------------------------------------
+
+
+def _resolve(
+    frame: Frame, sums: list[Sums], spread: Spread, moving: Tensor, values: Values
+) -> Blurred:
+    """Return the color that the sums stand for."""
+    if values.resolve == "normalized":
+        return _normalized(frame, sums, spread, moving, values)
+    changed: dict[str, object] = {
+        "separate_sums": values.resolve == "separate",
+        "center_weight": values.center_taps,
+        "resolution": "full",
+    }
+    if values.missing_background == "foreground":
+        sums = _over_nothing(sums, values)
+        changed["background_fade"] = 0.0
+    return compose(frame, sums, moving, Values(**(vars(values) | changed)))
+
+
+def _over_nothing(sums: list[Sums], values: Values) -> list[Sums]:
+    """Return the sums with the front opaque where there is no back."""
+    background = torch.stack([one.background for one in sums]).sum(0)
+    shown = (background > 0).to(background.dtype)
+    if values.background_fade > 0:
+        shown = saturate(background / values.background_fade, values.softness)
+    return [one._replace(alpha=1 - (1 - one.alpha) * shown) for one in sums]
+
+
+def _normalized(
+    frame: Frame, sums: list[Sums], spread: Spread, moving: Tensor, values: Values
+) -> Blurred:
+    total = Sums(*(torch.stack(planes).sum(0) for planes in zip(*sums, strict=True)))
+    center = values.center_taps / values.num_samples
+    if values.center_weight:
+        center = center + 1 / (values.kappa * torch.maximum(spread.length, values.min_length))
+    color, weight = resolve(
+        frame,
+        (total.background_color + total.foreground_color, total.background + total.foreground),
+        center,
+        moving,
+    )
+    alpha = torch.where(moving, (total.background + total.foreground).clamp(max=1), 0.0)
+    return Blurred(color, alpha, moving.to(alpha.dtype), weight, torch.zeros_like(alpha))

@@ -1,0 +1,351 @@
+"""The gather of torchblur's own filter: three kinds of taps, one set of weights and sums."""
+
+from __future__ import annotations
+
+from typing import Literal, NamedTuple
+
+import torch
+from torch import Tensor
+
+from torchblur.filters.base import Values
+from torchblur.filters.reconstruction import ColorLookup, Spread, Tap, is_one, sample, texture_of
+from torchblur.frame import Frame, Shutter
+from torchblur.ops.cubic import second_differences
+from torchblur.ops.gather import Inputs, Planes, pixel_grid, read, weighted
+from torchblur.ops.noise import dither_2x2, noise_plane
+from torchblur.ops.spread import Mirror, SpreadForm, TapPair, mirror, spread_weight
+from torchblur.ops.weights import DepthWeights, cone, cylinder, depth_weights, power, saturate
+
+__all__ = ["TapOptions", "alternate_tap", "pair_tap", "shared_inputs", "tap_options", "time_tap"]
+
+_TINY = 1e-6
+_PARAMETERS = (
+    "cone_slope",
+    "cone_exponent",
+    "cylinder_inner",
+    "cylinder_outer",
+    "foreground_gain",
+    "background_gain",
+    "third_gain",
+    "depth_level",
+    "min_length",
+    "spread_offset",
+    "spread_slope",
+    "direction_exponent",
+    "area_slope",
+    "match_tolerance",
+    "match_slope",
+)
+
+Added = tuple[Planes, Tensor, Planes, Tensor, Tensor]
+"""Color and weight of the back, color and weight of the front, and the front's alpha."""
+
+
+class TapOptions(NamedTuple):
+    """Switches of the taps; each set is compiled once."""
+
+    directions: tuple[str, ...]
+    """"first", "own", "second": those that take part, in the order of their taps."""
+    center: int
+    refinements: int
+    relative_depth: bool
+    shares: bool
+    spread: Literal["cone", "ramp"]
+    spread_form: SpreadForm
+    third: Literal["shorter", "product", "none"]
+    direction_weights: bool
+    linear_direction: bool
+    linear_cone: bool
+    mirror: Mirror
+    skip_middle_tap: bool
+    accurate_alpha: bool
+    fast_tiles: bool
+    softness: float
+    color_lookup: ColorLookup
+
+
+class _Weights(NamedTuple):
+    background: Tensor
+    foreground: Tensor
+    alpha: Tensor
+
+
+def tap_options(values: Values, directions: tuple[str, ...]) -> TapOptions:
+    """Return the switches that the parameters stand for."""
+    return TapOptions(
+        directions=directions,
+        center=Shutter(1, values.shutter_position).center,
+        refinements=values.refinements,
+        relative_depth=values.depth_compare == "relative",
+        shares=values.depth_classes == "shares",
+        spread=values.spread,
+        spread_form=values.spread_compare,
+        third=values.third_form,
+        direction_weights=values.direction_weights,
+        linear_direction=is_one(values.direction_exponent),
+        linear_cone=is_one(values.cone_exponent),
+        mirror=values.mirror_filter,
+        skip_middle_tap=values.skip_middle_tap and values.shutter_position == "centered",
+        accurate_alpha=values.accurate_alpha,
+        fast_tiles=values.tile_classes,
+        softness=values.softness,
+        color_lookup=values.color_lookup,
+    )
+
+
+def shared_inputs(frame: Frame, spread: Spread, values: Values) -> Inputs:
+    """Return the planes that the taps of all kinds look at."""
+    x, y = pixel_grid(frame.color)
+    if values.noise == "checkerboard":
+        shift = dither_2x2(frame.color)
+    else:
+        shift = noise_plane(values.noise, frame.color, 0, values.seed) - 0.5
+    relative = values.depth_compare == "relative"
+    inputs = {
+        "texture": texture_of(frame, spread),
+        "x": x,
+        "y": y,
+        "shift": shift * values.jitter,
+        "depth": frame.finite_depth(),
+        "half": spread.half,
+        "length": spread.length,
+        "extent": values.relative_depth_extent if relative else values.soft_depth_extent,
+    }
+    if values.color_lookup == "cubic":
+        inputs["texture_detail"] = second_differences(inputs["texture"][:, 4:])
+    return inputs | {key: getattr(values, key) for key in _PARAMETERS}
+
+
+# -- a time at which all directions compete --------------------------------------------------------
+
+
+def time_tap(index: Tensor, count: Tensor, inputs: Inputs, options: TapOptions) -> Added:
+    """Return what the pixel shows at one time: what passes it then, and what else may lie behind.
+
+    Each direction names a sample that would be at the pixel at this time. How well its own
+    motion takes it there is its match; the nearer of those that match hides the others.
+    """
+    time = (2 * (index + 0.5 + inputs["shift"]) / count - 1).clamp(-1, 1) + options.center
+    found = [
+        _follow(inputs[f"{name}_vector"], time, inputs, options) for name in options.directions
+    ]
+    total: Tensor | None = None
+    colors: list[Planes] = []
+    open_share = torch.ones_like(found[0][1])
+    for tap, match in found:
+        weight = match
+        for other, its_match in found:
+            if other is not tap:
+                hidden = _classes(tap.depth, other.depth, inputs, options).foreground
+                weight = weight * (1 - its_match * hidden)
+        open_share = open_share * (1 - match)
+        seen = weight if tap.valid is None else weight * tap.valid
+        colors.append((*weighted(weight, tap.color), seen))
+        total = weight if total is None else total + weight
+    assert total is not None
+    some = total > _TINY
+    covered = torch.where(some, 1 - open_share, 0.0)
+    gain = inputs["foreground_gain"] * covered / torch.where(some, total, 1.0)
+    *front, seen = (gain * sum(planes[1:], planes[0]) for planes in zip(*colors, strict=True))
+    back, weight = _behind(time, 1 - covered, inputs, options)
+    return back, weight, tuple(front), seen, covered
+
+
+def _follow(
+    vector: Tensor, time: Tensor, inputs: Inputs, options: TapOptions
+) -> tuple[Tap, Tensor]:
+    """Return the sample that moves to the pixel, and how well it does: its match in [0, 1]."""
+    dx, dy = vector.split(1, 1)
+    for _ in range(options.refinements):
+        place = inputs["x"] - time * dx, inputs["y"] - time * dy
+        ux, uy, size = read(inputs, *place, channels=slice(0, 3))
+        dx, dy = ux * size, uy * size
+    tap = sample(inputs, inputs["x"] - time * dx, inputs["y"] - time * dy, options.color_lookup)
+    miss_x, miss_y = tap.unit_x * tap.length - dx, tap.unit_y * tap.length - dy
+    miss = (miss_x.square() + miss_y.square() + 1e-12).sqrt() * time.abs()
+    far = (dx.square() + dy.square() + 1e-12).sqrt() * time.abs()
+    allowed = inputs["match_tolerance"] + inputs["match_slope"] * far
+    return tap, saturate(1 - miss / allowed, options.softness)
+
+
+def _behind(
+    time: Tensor, share: Tensor, inputs: Inputs, options: TapOptions
+) -> tuple[Planes, Tensor]:
+    """Return color and weight of the tap on the pixel's own line, as far as it lies behind."""
+    dx, dy = inputs["half"].split(1, 1)
+    tap = sample(inputs, inputs["x"] - time * dx, inputs["y"] - time * dy, options.color_lookup)
+    classes = _classes(inputs["depth"], tap.depth, inputs, options)
+    weight = inputs["background_gain"] * share * classes.background
+    return weighted(weight, tap.color), weight if tap.valid is None else weight * tap.valid
+
+
+# -- one direction by turns ------------------------------------------------------------------------
+
+
+def alternate_tap(index: Tensor, count: Tensor, inputs: Inputs, options: TapOptions) -> Added:
+    """Return what one tap adds; the directions take turns."""
+    names = options.directions
+    turn = torch.remainder(index, len(names))
+    unit, reach, own = (inputs[f"{names[0]}_{key}"] for key in ("unit", "reach", "agrees"))
+    for number, name in enumerate(names[1:], 1):
+        mine = turn == number
+        unit = torch.where(mine, inputs[f"{name}_unit"], unit)
+        reach = torch.where(mine, inputs[f"{name}_reach"], reach)
+        own = torch.where(mine, inputs[f"{name}_agrees"], own)
+    t = (2 * (index + 1 + inputs["shift"]) / (count + 1) - 1).clamp(-1, 1)
+    per_px = 0.5 * count / reach.clamp_min(_TINY)
+    tap, weights = _tap(t, (unit, reach, own, per_px), inputs, options)
+    if options.skip_middle_tap:
+        weights = _Weights(*(w * (2 * index != count - 1) for w in weights))
+    return _sums(tap, _plain(weights, inputs, options))
+
+
+# -- both sides of the pixel -----------------------------------------------------------------------
+
+
+def pair_tap(index: Tensor, count: Tensor, inputs: Inputs, options: TapOptions) -> Added:
+    """Return what two taps add, at equal times before and after the middle of the exposure."""
+    pairs = inputs["pairs"]
+    step, shift = (index + 0.5) / pairs, inputs["shift"] / pairs
+    line = inputs["unit"], inputs["reach"], inputs["agrees"], pairs / inputs["reach"]
+    times = [(side * step + shift).clamp(-1, 1) for side in (1, -1)]
+    taps, weights = zip(*(_tap(t, line, inputs, options) for t in times), strict=True)
+    mirrored = mirror(
+        TapPair(*(torch.cat(w, 1) for w in weights)),
+        TapPair(*(tap.depth for tap in taps)),
+        TapPair(*(tap.length for tap in taps)),
+        options.mirror,
+    )
+    taken = (index < pairs).to(step.dtype)
+    parts = []
+    for tap, joined in zip(taps, mirrored, strict=True):
+        plain = _plain(_Weights(*joined.split(1, 1)), inputs, options)
+        parts.append(_sums(tap, _Weights(*(taken * w for w in plain))))
+    later, earlier = parts
+    return (
+        _added(later[0], earlier[0]),
+        later[1] + earlier[1],
+        _added(later[2], earlier[2]),
+        later[3] + earlier[3],
+        later[4] + earlier[4],
+    )
+
+
+def _added(first: Planes, second: Planes) -> Planes:
+    return tuple(a + b for a, b in zip(first, second, strict=True))
+
+
+# -- weights ---------------------------------------------------------------------------------------
+
+
+def _plain(weights: _Weights, inputs: Inputs, options: TapOptions) -> _Weights:
+    """Return the weights; where all tiles move alike all of it is front."""
+    if not options.fast_tiles:
+        return weights
+    fast = inputs["fast"] > 0
+    back, front, alpha = weights
+    return _Weights(
+        *(torch.where(fast, v, w) for v, w in ((0.0, back), (1.0, front), (1.0, alpha)))
+    )
+
+
+def _sums(tap: Tap, weights: _Weights) -> Added:
+    back, front, alpha = weights
+    colors = weighted(back, tap.color), weighted(front, tap.color)
+    if tap.valid is not None:
+        back, front = back * tap.valid, front * tap.valid
+    return colors[0], back, colors[1], front, alpha
+
+
+def _classes(pixel: Tensor, other: Tensor, inputs: Inputs, options: TapOptions) -> DepthWeights:
+    """Return how far a sample is in front of a pixel, and behind it."""
+    classes = depth_weights(
+        pixel,
+        other,
+        inputs["extent"],
+        relative=options.relative_depth,
+        level=inputs["depth_level"],
+        softness=options.softness,
+    )
+    return classes._replace(foreground=1 - classes.background) if options.shares else classes
+
+
+def _tap(
+    t: Tensor, line: tuple[Tensor, Tensor, Tensor, Tensor], inputs: Inputs, options: TapOptions
+) -> tuple[Tap, _Weights]:
+    """Return what lies at a time t in [-1, 1] of a line, and its weights.
+
+    Args:
+        t: Time.
+        line: Direction, half spread of the tile in px, agreement with the pixel's direction, and
+            taps per px.
+        inputs: The planes.
+        options: The switches.
+    """
+    unit, reach, own, per_px = line
+    along = (t + options.center) * reach
+    dx, dy = unit.split(1, 1)
+    tap = sample(inputs, inputs["x"] - along * dx, inputs["y"] - along * dy, options.color_lookup)
+    toward = tap.unit_x * dx + tap.unit_y * dy
+    distance_s = distance_p = along.abs()
+    if options.center:
+        moved_p = (inputs["half"] * unit).sum(1, keepdim=True)
+        distance_s = (along - options.center * tap.length * toward).abs()
+        distance_p = (along - options.center * moved_p).abs()
+    classes = _classes(inputs["depth"], tap.depth, inputs, options)
+    front = inputs["foreground_gain"] * classes.foreground
+    back = inputs["background_gain"] * classes.background
+    if options.spread == "ramp":
+        front = front * _ramp(distance_s * per_px, tap.length * per_px, inputs, options)
+        back = back * _ramp(distance_p * per_px, inputs["length"] * per_px, inputs, options)
+    else:
+        front = front * _cone(distance_s, tap.length, inputs, options)
+        back = back * _cone(distance_p, inputs["length"], inputs, options)
+    third = _third(distance_s, distance_p, tap, inputs, options)
+    if options.direction_weights:
+        theirs = toward.abs()
+        if not options.linear_direction:
+            theirs = power(theirs, inputs["direction_exponent"])
+        front, back = front * theirs, back * own
+        third = None if third is None else third * torch.maximum(own, theirs)
+    if third is not None:
+        front = front + third
+    alpha = front
+    if options.accurate_alpha:
+        alpha = saturate(front / (1 + inputs["area_slope"] * tap.length), options.softness)
+    return tap, _Weights(back, front, alpha)
+
+
+def _ramp(distance: Tensor, reach: Tensor, inputs: Inputs, options: TapOptions) -> Tensor:
+    return spread_weight(
+        distance,
+        reach,
+        offset=inputs["spread_offset"],
+        slope=inputs["spread_slope"],
+        form=options.spread_form,
+        softness=options.softness,
+    )
+
+
+def _cone(distance: Tensor, size: Tensor, inputs: Inputs, options: TapOptions) -> Tensor:
+    exponent = None if options.linear_cone else inputs["cone_exponent"]
+    size = torch.maximum(size, inputs["min_length"])
+    return cone(distance, size, inputs["cone_slope"], exponent, options.softness)
+
+
+def _third(
+    distance_s: Tensor, distance_p: Tensor, tap: Tap, inputs: Inputs, options: TapOptions
+) -> Tensor | None:
+    """Return the weight of two blurs over each other."""
+    if options.third == "none":
+        return None
+    ends = inputs["cylinder_inner"], inputs["cylinder_outer"]
+    length_s = torch.maximum(tap.length, inputs["min_length"])
+    length_p = torch.maximum(inputs["length"], inputs["min_length"])
+    if options.third == "product":
+        both = cylinder(distance_s, length_s, *ends) * cylinder(distance_p, length_p, *ends)
+    else:
+        distance = torch.where(length_s <= length_p, distance_s, distance_p)
+        both = cylinder(distance, torch.minimum(length_s, length_p), *ends)
+    third: Tensor = inputs["third_gain"] * both
+    return third
