@@ -94,6 +94,7 @@ def fit_gradient(
     while state.step < job.method.steps:
         cpu = time.process_time()
         record = state.advance(problem)
+        record["passes"] = len(record["loss"]) * _share(job.method.batch, len(problem.samples))
         record["cpu_seconds"] = time.process_time() - cpu
         state.cpu_seconds += record["cpu_seconds"]
         state.seconds = time.monotonic() - began
