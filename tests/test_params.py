@@ -124,3 +124,18 @@ def test_tensors_of_values_are_checked():
 def test_nearest_name():
     assert nearest_name("kapa", ["kappa", "gamma"]) == " (did you mean `kappa`?)"
     assert nearest_name("zzz", ["kappa"]) == ""
+
+
+@pytest.mark.parametrize("scale", ["linear", "log"])
+def test_a_fit_can_leave_the_ends_of_a_range(scale):
+    """exp(log(40)) is a little more than 40: cutting that off must not cut off the gradient."""
+    ends = [(1.0, 40.0), (0.05, 20.0), (0.1, 8.0), (1.0, 1000.0)]
+    for low, high in ends:
+        spec = Param(meaning="", grad="smooth", source="", low=low, high=high, scale=scale)
+        unit = torch.tensor([0.0, 1.0], dtype=torch.float64, requires_grad=True)
+        values = spec.from_unit(unit)
+        assert low <= float(values[0]) <= float(values[1]) <= high
+        values.sum().backward()
+        slopes = (low, high) if scale == "log" else (1.0, 1.0)
+        span = torch.tensor(high / low).log().item() if scale == "log" else high - low
+        assert unit.grad.tolist() == pytest.approx([slope * span for slope in slopes], rel=1e-6)

@@ -122,14 +122,15 @@ class Param:
     def from_unit(self, unit: Tensor) -> Tensor:
         """Map [0, 1] to [low, high]: the inverse of `to_unit`, never outside the range.
 
-        Differentiable: yes; the gradient is zero where rounding would leave the range.
+        Differentiable: yes, at the ends of the range too, where rounding may leave it: a fit that
+        begins there must be able to go back.
         """
         low, high = self.bounds
         if self.scale == "log":
             value = torch.exp(unit * (math.log(high) - math.log(low)) + math.log(low))
         else:
             value = unit * (high - low) + low
-        return value.clamp(low, high)
+        return value.detach().clamp(low, high) + (value - value.detach())
 
     def __get_pydantic_core_schema__(
         self, source: Any, handler: GetCoreSchemaHandler
