@@ -128,7 +128,7 @@ def test_nearest_name():
 
 @pytest.mark.parametrize("scale", ["linear", "log"])
 def test_a_fit_can_leave_the_ends_of_a_range(scale):
-    """At 1 the logarithmic range may come out above its end: cutting that off must not cut off the gradient."""
+    """Rounding may put the end of a range outside: cutting that off must keep the gradient."""
     ends = [(0.01, 3.0), (0.01, 40.0), (0.05, 20.0), (1.0, 1000.0)]
     for low, high in ends:
         spec = Param(meaning="", grad="smooth", source="", low=low, high=high, scale=scale)
