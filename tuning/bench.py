@@ -38,7 +38,7 @@ class Limits(Config):
     """How long each measurement may take."""
 
     runs: int = 5
-    seconds: float = 6.0
+    seconds: float = 4.0
     threads: int = 1
     memory: bool = True
     checks: bool = True
@@ -115,7 +115,7 @@ def _limits(options: BenchOptions) -> Limits:
     threads = min(cores, _TARGET_THREADS) if options.targets and not on_gpu else cores
     return Limits(
         runs=options.runs or (2 if options.quick else 50 if on_gpu else 5),
-        seconds=2.0 if options.quick else 6.0,
+        seconds=2.0 if options.quick else 4.0,
         threads=options.threads or int(os.environ.get("OMP_NUM_THREADS") or threads),
     )
 

@@ -36,7 +36,7 @@ class BenchJob(Config):
 
     cases: list[Case]
     runs: int = Field(5, ge=1, description="timed runs of each")
-    seconds: float = Field(6.0, gt=0, description="after so long no new run begins")
+    seconds: float = Field(4.0, gt=0, description="after so long no new run begins")
     threads: int = Field(1, ge=1, description="threads of torch on the CPU")
     memory: bool = Field(True, description="also measure the peak of memory")
     checks: bool = Field(True, description="CUDA: look for waits, try a graph")
@@ -148,7 +148,6 @@ def _found(case: Case, first: float, times: Times) -> dict[str, Any]:
 
 def _peak(case: Case) -> dict[str, Any]:
     call = Step(case).whole if case.kind == "step" else make_call(case)
-    call()
     return {"peak_mib": peak_mib(call, torch.device(case.device))}
 
 

@@ -21,7 +21,8 @@ TABLES: tuple[TableName, ...] = get_args(TableName)
 
 _TAPS = (19, 27, 35, 47)  # Guertin 2014, table 1
 _MOVING = (0, 10, 50, 100)
-_SWEPT = ("guertin2014", "notes2025", "oberberger2022")
+_SWEPT = ("guertin2014", "notes2025")
+_BY_AREA = (*_SWEPT, "oberberger2022")
 _NOTES = (("full", "two"), ("full", "one"), ("half", "two"), ("half", "one"))
 _SIZE = re.compile(r"(\d+)x(\d+)")
 
@@ -71,7 +72,7 @@ class _Scale:
 
 
 _WHOLE = _Scale(
-    base=(640, 360),
+    base=(480, 270),
     swept=(1280, 720),
     sizes=((640, 360), (1280, 720), (1920, 1080)),
     batch=4,
@@ -183,7 +184,7 @@ class _Planner:
     def moving(self) -> TablePlan:
         cases = [
             case.but(what=what, moving=moving)
-            for name, engine in self._swept()
+            for name, engine in self._swept(_BY_AREA)
             for size in self.given or (self.scale.swept,)
             for what in self._whats("forward")
             for case in self._cases(name, size, self.num_samples[:1], engine)
@@ -259,8 +260,8 @@ class _Planner:
             for width, height in sizes
         ]
 
-    def _swept(self) -> list[tuple[str, str]]:
-        names = self.options.filters or _SWEPT
+    def _swept(self, default: tuple[str, ...] = _SWEPT) -> list[tuple[str, str]]:
+        names = self.options.filters or default
         if self.options.full and not self.options.filters:
             names = tuple(registered_filters())
         return [(name, engine) for name in names for engine in self._engines()]

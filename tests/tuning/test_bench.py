@@ -12,6 +12,7 @@ from torchblur.errors import ConfigError, OutputError
 from tuning.bench import Limits, check_output, measure_cases, run_bench
 from tuning.bench_cases import Case, LinearFit, Report, Row, Table, TargetRow
 from tuning.bench_child import MARK, BenchJob, run_job
+from tuning.bench_measure import Times
 from tuning.bench_plan import TABLES, BenchOptions, plan_tables, unique_cases
 from tuning.bench_table import print_report
 from tuning.commands import app
@@ -167,6 +168,44 @@ class TestJobs:
         job = BenchJob(cases=[TINY.but(engine="compiled")], runs=1, memory=False)
         run_job(job, told.__setitem__)
         assert told[0]["checks"] == {"compiled": "no: there is no compiler"}
+
+
+class TestJobsOnAGpu:
+    """The order of things, with stand-ins for what needs a GPU."""
+
+    @pytest.fixture
+    def told(self, monkeypatch):
+        def no_graph(call, runs):
+            raise RuntimeError("not permitted while a stream is capturing\nmore")
+
+        times = Times(runs=3, wall=0.1, cpu=0.1, device=0.5, spread=0.0, others=None, waited=False)
+        child = "tuning.bench_child"
+        monkeypatch.setattr(f"{child}.make_call", lambda case: lambda: None)
+        monkeypatch.setattr(f"{child}.repeat", lambda *args: times)
+        monkeypatch.setattr(f"{child}.peak_mib", lambda call, device: 3.0)
+        monkeypatch.setattr(f"{child}.find_sync", lambda call: "line.py:3 f")
+        monkeypatch.setattr(f"{child}.graph_ms", no_graph)
+        monkeypatch.setattr(f"{child}.exact_allocation", lambda: pytest.fail("of the CPU"))
+        monkeypatch.setattr(torch.cuda, "synchronize", lambda device=None: None)
+        monkeypatch.setattr(torch, "set_num_threads", lambda count: None)
+        cases = [TINY.but(device="cuda", what=what) for what in ("forward", "backward")]
+        found = []
+        run_job(BenchJob(cases=cases), lambda index, part: found.append((index, part)))
+        return found
+
+    def test_checks_come_last(self, told):
+        assert [index for index, _ in told] == [0, 1] * 3
+        assert ["wall_s" in part for _, part in told] == [True, True] + [False] * 4
+        assert told[0][1]["device_ms"] == 0.5
+        assert told[2][1] == {"peak_mib": 3.0}
+
+    def test_a_graph_that_cannot_be_had_is_a_remark(self, told):
+        forward, backward = (part for _, part in told[-2:])
+        assert forward["checks"] == {
+            "sync": "line.py:3 f",
+            "graph": "not permitted while a stream is capturing",
+        }
+        assert backward["checks"] == {"sync": "line.py:3 f"}
 
 
 class TestProcesses:

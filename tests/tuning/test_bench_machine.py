@@ -3,8 +3,10 @@
 import os
 import subprocess
 import sys
+from types import SimpleNamespace
 
 import pytest
+import torch
 
 from tuning.bench_machine import (
     CpuTicks,
@@ -77,3 +79,12 @@ def test_machine_is_described():
     assert machine["memory_gib"] > 0
     assert "gpu" not in machine
     assert machine["commit"] is None or len(machine["commit"].rstrip("+")) == 12
+
+
+def test_gpu_is_described(monkeypatch):
+    properties = SimpleNamespace(
+        name="G", total_memory=80 * 2**30, major=9, minor=0, multi_processor_count=132
+    )
+    monkeypatch.setattr(torch.cuda, "get_device_properties", lambda device: properties)
+    gpu = describe_machine("cuda", 1)["gpu"]
+    assert (gpu["name"], gpu["memory_gib"], gpu["capability"]) == ("G", 80.0, "9.0")
