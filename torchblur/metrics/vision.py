@@ -14,6 +14,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from torchblur.metrics.vision_steps import cube_root_curve, length, mix, power
+
 __all__ = ["Kernels", "View", "make_kernels", "perceive", "visible_error"]
 
 _Matrix = list[list[float]]
@@ -153,13 +155,13 @@ def perceive(color: Tensor, kernels: Kernels) -> View:
     Reference: Andersson et al. 2020, sections 4.1.1, 4.1.2 and 4.2.
     """
     _, to_opponent, to_rgb = _matrices()
-    y, cx, cz = _mix(color, to_opponent).chunk(3, dim=1)
+    y, cx, cz = mix(color, to_opponent).chunk(3, dim=1)
     passed = _filter(torch.cat([y, y, y, y, cx, cz, cz], dim=1), kernels.across)
     y, g, edge, point, cx, cz1, cz2 = passed.chunk(7, dim=1)
     passed = _filter(torch.cat([y, cx, cz1, cz2, edge, g, point, g], dim=1), kernels.down)
     y, cx, cz1, cz2, edges, points = passed.split([1, 1, 1, 1, 2, 2], dim=1)
-    rgb = _mix(torch.cat([y, cx, cz1 + cz2], dim=1), to_rgb).clamp(0, 1)
-    return View(_hunt_lab(rgb), _length(edges), _length(points))
+    rgb = mix(torch.cat([y, cx, cz1 + cz2], dim=1), to_rgb).clamp(0, 1)
+    return View(_hunt_lab(rgb), length(edges, _NORM_FLOOR), length(points, _NORM_FLOOR))
 
 
 def _filter(planes: Tensor, taps: Tensor) -> Tensor:
@@ -181,19 +183,10 @@ def _matrices() -> tuple[_Matrix, _Matrix, _Matrix]:
     return xyz.tolist(), opponent.tolist(), opponent.inverse().tolist()
 
 
-def _mix(planes: Tensor, matrix: _Matrix) -> Tensor:
-    # Written out: as a matrix product or a convolution it would lose digits to TF32 on a GPU.
-    x, y, z = planes.chunk(3, dim=1)
-    rows = [torch.add(torch.add(a * x, y, alpha=b), z, alpha=c) for a, b, c in matrix]
-    return torch.cat(rows, dim=1)
-
-
 def _hunt_lab(rgb: Tensor) -> Tensor:
     """Return CIELab with chroma scaled by lightness (the Hunt effect)."""
-    xyz = _mix(rgb, _matrices()[0])
-    cube = _LAB_DELTA**3
-    root = xyz.clamp_min(cube) ** (1 / 3)
-    f = torch.where(xyz > cube, root, xyz / (3 * _LAB_DELTA**2) + 4 / 29)
+    xyz = mix(rgb, _matrices()[0])
+    f = cube_root_curve(xyz, _LAB_DELTA**3, 1 / (3 * _LAB_DELTA**2), 4 / 29)
     fx, fy, fz = f.chunk(3, dim=1)
     lightness = 116 * fy - 16
     scale = _HUNT * lightness
@@ -217,12 +210,12 @@ def visible_error(view: View, reference: View) -> Tensor:
     color = _color_difference(view.lab, reference.lab)
     edge, point = (view.edge - reference.edge).abs(), (view.point - reference.point).abs()
     strength = torch.maximum(edge, point) / math.sqrt(2)
-    feature = _power(strength, _FEATURE_EXPONENT, _FEATURE_LINE)
+    feature = power(strength, _FEATURE_EXPONENT, _FEATURE_LINE)
     return color * color.clamp_min(_ERROR_LINE) ** -feature
 
 
 def _color_difference(lab: Tensor, reference: Tensor) -> Tensor:
-    distance = _power(_hyab(lab - reference), _COLOR_EXPONENT, _COLOR_LINE)
+    distance = power(_hyab(lab - reference), _COLOR_EXPONENT, _COLOR_LINE)
     greatest = _greatest_distance()
     knee = _KNEE_INPUT * greatest
     # The curve bends down at the knee, so it is the lower one of its two lines.
@@ -231,7 +224,7 @@ def _color_difference(lab: Tensor, reference: Tensor) -> Tensor:
 
 
 def _hyab(difference: Tensor) -> Tensor:
-    return difference[:, :1].abs() + _length(difference[:, 1:])
+    return difference[:, :1].abs() + length(difference[:, 1:], _NORM_FLOOR)
 
 
 @functools.cache
@@ -240,14 +233,3 @@ def _greatest_distance() -> float:
     green, blue = torch.eye(3, dtype=torch.float64)[1:, :, None, None].split(1)
     distance = float(_hyab(_hunt_lab(green) - _hunt_lab(blue)))
     return math.pow(distance, _COLOR_EXPONENT)
-
-
-def _length(vector: Tensor) -> Tensor:
-    """Return the length over the channels, with zero gradient at zero."""
-    square = (vector * vector).sum(dim=1, keepdim=True)
-    return torch.where(square > _NORM_FLOOR, square.clamp_min(_NORM_FLOOR).sqrt(), 0.0)
-
-
-def _power(x: Tensor, exponent: float, line: float) -> Tensor:
-    """Return x ** exponent for x >= 0, but a straight line from 0 to x = `line`."""
-    return x * x.clamp_min(line) ** (exponent - 1)
