@@ -22,7 +22,10 @@ from torchblur.filters.base import TemporalBlur
 from torchblur.io import load_yaml
 from torchblur.params import build
 from tuning.apply import FilterSettings, make_filter, recipe_of, samples_beside
+from tuning.cluster import Cluster
+from tuning.cluster_batch import run_on_cluster
 from tuning.config import apply_overrides
+from tuning.engine import files_engine
 from tuning.outputs import (
     Job,
     State,
@@ -190,7 +193,9 @@ def plan_batch(config: BatchConfig, *, overwrite: bool = False) -> Plan:
     return Plan(config, recipe, tuple(zip(jobs, states, strict=True)), overwrite)
 
 
-def run_batch(plan: Plan, progress: Progress | None = None) -> BatchResult:
+def run_batch(
+    plan: Plan, progress: Progress | None = None, cluster: Cluster | None = None
+) -> BatchResult:
     """Make all results of a plan that are not done; go on past frames that fail.
 
     The result is the same for any number of workers, and for a run that was stopped and started
@@ -204,12 +209,15 @@ def run_batch(plan: Plan, progress: Progress | None = None) -> BatchResult:
     Args:
         plan: What `plan_batch` returned.
         progress: Told after each frame.
+        cluster: Workers on this or other machines; left out: `plan.config.workers` threads here.
 
     Returns:
-        What was written, what failed and why, and whether the run was interrupted.
+        In the order of the plan: what was written, what failed and why; and whether the run was
+        interrupted.
 
     Raises:
         OutputError: results made with other settings are in the way, or a folder cannot be made.
+        ClusterError: a worker does not see the files, or the scheduler or all workers are gone.
     """
     plan.check()
     jobs = plan.todo
@@ -220,16 +228,18 @@ def run_batch(plan: Plan, progress: Progress | None = None) -> BatchResult:
     stage = Stage("batch", len(jobs), progress)
     stage.step(0)
     log = _Log(result, stage)
-    runner = Runner(
-        make_filter(plan.config),
-        plan.config,
-        plan.recipe,
-        workers=plan.config.workers,
-        prefetch=plan.config.prefetch,
-        log=log,
-    )
-    stopped = runner.run(_tasks(plan))
+    blur = make_filter(plan.config)
+    blur.engine = files_engine(blur, [job for job, _ in plan.states])
+    config, tasks = plan.config, _tasks(plan)
+    common: dict[str, Any] = {"recipe": plan.recipe, "prefetch": config.prefetch, "log": log}
+    if cluster is not None:
+        stopped = run_on_cluster(cluster, tasks, blur, config, **common)
+    else:
+        stopped = Runner(blur, config, workers=config.workers, **common).run(tasks)
     result.interrupted = stopped and len(result.written) + len(result.failures) < len(jobs)
+    place = {output: index for index, output in enumerate(outputs)}
+    result.written.sort(key=place.__getitem__)
+    result.failures.sort(key=lambda failure: place[failure.job.output])
     return result
 
 

@@ -62,6 +62,11 @@ def open_cluster(
     Raises:
         ClusterError: Dask is not installed, or no scheduler or worker answers.
     """
+    if scheduler is not None and workers is not None:
+        raise ClusterError(
+            f"give the address of a scheduler or a number of workers to start, got both: "
+            f"{scheduler} and {workers}"
+        )
     dask = _load_dask()
     local: Any = None if scheduler else _start_local(dask, workers or 1)
     try:

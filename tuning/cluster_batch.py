@@ -19,6 +19,7 @@ from typing import Any
 
 from torchblur.errors import OutputError
 from torchblur.filters import BlurFilter
+from torchblur.ops.compiling import compiler_works
 from torchblur.ops.gather import Engine
 from tuning.apply import FilterSettings, make_filter
 from tuning.cluster import Cluster, ClusterError, Flight, Lost, here, share_cores
@@ -90,7 +91,7 @@ def run_on_cluster(
     with _probe(sent[0].jobs[0].output.parent) as probe:
         order = _Order(
             settings=_plain(settings, blur),
-            engine=blur.engine,
+            engine="compiled" if blur.engine == "compiled" and compiler_works() else "eager",
             recipe=recipe,
             prefetch=prefetch,
             probe=probe,

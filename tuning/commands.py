@@ -7,11 +7,11 @@ from __future__ import annotations
 
 import shlex
 import warnings
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Iterator, Mapping
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from importlib.metadata import version
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from typer.core import TyperGroup
@@ -19,9 +19,12 @@ from typer.core import TyperGroup
 from tuning.bench_command import bench
 from tuning.console import metrics_table, print_error, print_warning, results, show_progress
 from tuning.evidence_commands import ablate, study
-from tuning.options import ConventionName, NoCompile, Overwrite, Set
+from tuning.options import ConventionName, NoCompile, Overwrite, Scheduler, Set
 from tuning.race_command import race
 from tuning.render_command import render
+
+if TYPE_CHECKING:
+    from tuning.cluster import Cluster
 
 __all__ = ["app"]
 
@@ -119,7 +122,7 @@ def _options(
 
 
 @app.command()
-def tune(
+def tune(  # noqa: PLR0913 - each argument is an option
     config: Annotated[
         Path,
         typer.Argument(metavar="CONFIG", help="What to fit to what; configs/tune has examples."),
@@ -137,13 +140,19 @@ def tune(
         str | None, typer.Option(metavar="NAME", help="auto, cpu, cuda, cuda:1 …")
     ] = None,
     no_compile: NoCompile = False,
+    scheduler: Scheduler = None,
+    workers: Annotated[
+        int | None, typer.Option(metavar="N", min=1, help="The same, on N processes started here.")
+    ] = None,
 ) -> None:
     """Fit a filter's parameters to reference renders.
 
     The run folder gets the tuned preset, which `torchblur filter` and `torchblur batch` take, and
-    a report with the evidence.
+    a report with the evidence. A cluster takes the candidates that a search draws together
+    (`population`); `torchrun -m tuning tune CONFIG` splits the windows of each step.
     """
     from tuning.config import load_tune_config
+    from tuning.distributed import RankZeroStoppedError, rank_here
     from tuning.fit import run_fit
     from tuning.printing import print_fit
 
@@ -152,15 +161,19 @@ def tune(
     folder = output or Path("runs") / config.stem
     loaded = load_tune_config(config, overrides)
     try:
-        with show_progress() as progress:
-            result = run_fit(loaded, folder, resume, progress, overwrite=overwrite)
+        with show_progress() as progress, _cluster(scheduler, workers) as cluster:
+            result = run_fit(loaded, folder, resume, progress, overwrite=overwrite, cluster=cluster)
+    except RankZeroStoppedError as error:
+        raise typer.Exit(_FAILED) from error
     except KeyboardInterrupt as error:
-        again = shlex.join(_tune_again(config, folder, overrides))
+        places = {"--scheduler": scheduler, "--workers": workers}
+        again = shlex.join(_tune_again(config, folder, overrides, places))
         print_error(
             f"stopped (Ctrl-C); nothing but the step in flight is lost. Go on with: {again}"
         )
         raise typer.Exit(_INTERRUPTED) from error
-    print_fit(result, folder)
+    if rank_here() == 0:
+        print_fit(result, folder)
 
 
 @app.command("filter")
@@ -230,6 +243,7 @@ def batch(
         int | None, typer.Option(metavar="N", help="Frames that are filtered at a time.")
     ] = None,
     no_compile: NoCompile = False,
+    scheduler: Scheduler = None,
 ) -> None:
     """Filter many frames; what is done is skipped, so a stopped run goes on when started again."""
     from tuning.batch import load_batch_config, plan_batch, run_batch
@@ -241,8 +255,8 @@ def batch(
         print_plan(plan)
         plan.check()
         return
-    with show_progress() as progress:
-        result = run_batch(plan, progress)
+    with show_progress() as progress, _cluster(scheduler) as cluster:
+        result = run_batch(plan, progress, cluster)
     print_batch(plan, result)
     if result.interrupted:
         raise typer.Exit(_INTERRUPTED)
@@ -340,6 +354,19 @@ def inspect(
     print_inspection(inspect_file(file, reference, convention=convention))
 
 
-def _tune_again(config: Path, folder: Path, overrides: list[str]) -> list[str]:
+def _cluster(
+    scheduler: str | None, workers: int | None = None
+) -> AbstractContextManager[Cluster | None]:
+    if scheduler is None and workers is None:
+        return nullcontext()
+    from tuning.cluster import open_cluster
+
+    return open_cluster(scheduler, workers=workers)
+
+
+def _tune_again(
+    config: Path, folder: Path, overrides: list[str], places: Mapping[str, Any]
+) -> list[str]:
     changes = [word for text in overrides for word in ("--set", text)]
-    return ["torchblur", "tune", str(config), "-o", str(folder), *changes, "--resume"]
+    where = [word for name, value in places.items() if value for word in (name, str(value))]
+    return ["torchblur", "tune", str(config), "-o", str(folder), *changes, *where, "--resume"]

@@ -31,6 +31,7 @@ from tuning.result import FitResult
 __all__ = ["RankZeroStoppedError", "Ranks", "is_restarted", "join_ranks", "rank_here"]
 
 _LONG = timedelta(days=30)  # others wait while rank 0 searches; a dead process is noticed at once
+_MEETING = timedelta(minutes=10)
 _CPU = torch.device("cpu")
 
 
@@ -39,8 +40,8 @@ class RankZeroStoppedError(ClusterError):
 
 
 def rank_here() -> int:
-    """Return this process's rank; 0 if torchrun did not start it."""
-    return int(os.environ["RANK"]) if "TORCHELASTIC_RUN_ID" in os.environ else 0
+    """Return this process's rank; 0 if it is alone."""
+    return int(os.environ["RANK"]) if _is_one_of_many() else 0
 
 
 def is_restarted() -> bool:
@@ -50,7 +51,7 @@ def is_restarted() -> bool:
 
 @contextmanager
 def join_ranks(device: str) -> Iterator[Ranks | None]:
-    """Join the other processes of this run; None if torchrun did not start this one.
+    """Join the other processes of this run; None if this one is alone.
 
     Args:
         device: As the configuration names it; a rank that has a GPU of its own uses it for "auto"
@@ -59,13 +60,12 @@ def join_ranks(device: str) -> Iterator[Ranks | None]:
     Raises:
         ClusterError: the others do not answer.
     """
-    if "TORCHELASTIC_RUN_ID" not in os.environ:
+    if not _is_one_of_many():
         yield None
         return
     own_gpu = _take_gpu(device)
-    backend = "cpu:gloo,cuda:nccl" if own_gpu else "cpu:gloo"
     with _clear_end():
-        dist.init_process_group(backend, timeout=_LONG)
+        _meet("cpu:gloo,cuda:nccl" if own_gpu else "cpu:gloo")
     ranks = Ranks(torch.device("cuda", torch.cuda.current_device()) if own_gpu else _CPU)
     try:
         yield ranks
@@ -204,13 +204,29 @@ class Ranks:
         return message
 
 
+def _is_one_of_many() -> bool:
+    """Return whether torchrun, or another launcher that tells the same, started this process."""
+    return all(name in os.environ for name in ("RANK", "WORLD_SIZE", "MASTER_ADDR", "MASTER_PORT"))
+
+
+def _meet(backend: str) -> None:
+    from torch.distributed.distributed_c10d import PrefixStore
+    from torch.distributed.rendezvous import rendezvous
+
+    store, rank, count = next(rendezvous("env://", timeout=_MEETING))
+    # torchrun keeps its store when it starts the ranks anew, with the addresses of the dead ones.
+    attempt = os.environ.get("TORCHELASTIC_RESTART_COUNT", "0")
+    store = PrefixStore(f"attempt {attempt}", store)
+    dist.init_process_group(backend, store=store, rank=rank, world_size=count, timeout=_LONG)
+
+
 def _take_gpu(device: str) -> bool:
     """Choose this rank's GPU; return whether each rank of this machine has one of its own."""
     if device not in ("auto", "cuda") or not torch.cuda.is_available():
         return False
     there = torch.cuda.device_count()
-    torch.cuda.set_device(int(os.environ["LOCAL_RANK"]) % there)
-    return int(os.environ["LOCAL_WORLD_SIZE"]) <= there
+    torch.cuda.set_device(int(os.environ.get("LOCAL_RANK", os.environ["RANK"])) % there)
+    return int(os.environ.get("LOCAL_WORLD_SIZE", os.environ["WORLD_SIZE"])) <= there
 
 
 @contextmanager

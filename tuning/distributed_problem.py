@@ -147,7 +147,11 @@ class ShardedProblem(Problem):
         }
         more: dict[str, Any] = {"weights": weights, "unroll": unroll, "slopes": tuple(leaves)}
         found = self._crew.ask(self._request("sum", values, count, chosen, **more))
-        yield _Known.apply(found[0], found[1:], *leaves.values()) if leaves else found[0]
+        if leaves:
+            known: Any = _Known.apply
+            yield known(found[0], found[1:], *leaves.values())
+        else:
+            yield found[0]
         if self.objective.cost > 0:
             yield torch.full((count,), self._cost(values), dtype=torch.float64)
 

@@ -93,8 +93,9 @@ def run_fit(
     config, path = resolve(config), Path(output_dir)
     with join_ranks(config.device) as ranks:
         if ranks is None:
+            workers = None if cluster is None else partial(ClusterProblem, cluster)
             with open_run(path, config, resume=resume, overwrite=overwrite) as folder:
-                return _fit(config, folder, progress, cluster and partial(ClusterProblem, cluster))
+                return _fit(config, folder, progress, workers)
         if cluster is not None:
             raise ClusterError("a fit goes to torchrun's processes or to a Dask cluster, not both")
         if ranks.rank > 0:
