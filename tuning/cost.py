@@ -23,7 +23,7 @@ from torchblur.params import build
 
 __all__ = ["Cost", "cost_at", "cost_of"]
 
-_BILINEAR = 2.0  # lookups that a bilinear one counts for
+_LOOKUPS = {"nearest": 1.0, "bilinear": 2.0, "opportunistic": 2.0, "cubic": 10.0}
 _WEIGHTS = 2.0  # arithmetic of a tap with weights from depth and motion, in lookups
 _TWO_SUMS = 4.0  # the same where foreground and background have sums of their own
 _PASS = 6.0  # a pass over the image: what it reads of the pixel itself, sets up and writes
@@ -114,8 +114,8 @@ def _reference() -> float:
 
 
 def _color(lookup: str) -> float:
-    """Return what one lookup of a color counts for."""
-    return 1.0 if lookup == "nearest" else _BILINEAR
+    """Return what one lookup of a color counts for; a cubic one is that of 16 pixels."""
+    return _LOOKUPS[lookup]
 
 
 def _gather(taps: float, lookup: str, arithmetic: float = _WEIGHTS) -> Cost:
@@ -165,8 +165,7 @@ def _notes(config: Any) -> Cost:
     main = _notes_lines(config) + _tiles(size, 2 if config.directions == "one" else 3)
     whole = main * _layers(config)
     if config.post_filter:
-        taps = 2 * max(config.post_samples // 2, 1) * _directions(config)
-        whole += Cost(taps, taps, taps * _WEIGHTS, passes=1)
+        whole += _post_filter(config, 1 if config.directions == "one" else 2)
     if config.resolution == "full":
         return whole
     # Down: 2x2 pixels of color, motion and depth, once for four. Up: four small ones and their
@@ -182,8 +181,9 @@ def _notes_lines(config: Any) -> Cost:
     return first + _gather(taps, config.color_lookup, _TWO_SUMS)
 
 
-def _directions(config: Any) -> int:
-    return 1 if config.directions == "one" else 2
+def _post_filter(config: Any, directions: int) -> Cost:
+    taps = 2 * max(config.post_samples // 2, 1) * directions
+    return Cost(taps, taps, taps * _WEIGHTS, passes=1)
 
 
 def _layers(config: Any) -> int:
@@ -217,6 +217,34 @@ def _oberberger(config: Any) -> Cost:
     return whole + turn * int(config.second_stage_iterations)
 
 
+def _composed(config: Any) -> Cost:
+    """Return torchblur's own filter: times, turns or pairs."""
+    ways = max(config.first_direction + config.own_direction + config.second_direction, 1)
+    tiles = _tiles(config.tile_size, 3 if config.second_direction else 2)
+    taps, color = config.num_samples, _color(config.color_lookup)
+    if config.sampling == "times":
+        # At each time a sample of each direction, which is followed, and one on the pixel's line.
+        samples = taps * (ways + 1)
+        followed = Cost(lookups=taps * ways * config.refinements)
+        main = Cost(samples, samples * (color + 1), samples * _WEIGHTS, passes=1) + followed
+    elif config.sampling == "alternate":
+        main = _gather(taps, config.color_lookup, _TWO_SUMS)
+    else:
+        lines = ways + (1 if config.double_samples else 0)
+        main = _gather(_pairs(taps), config.color_lookup, _TWO_SUMS) * lines
+    if config.edge_motion != "own":
+        main += Cost(lookups=9, passes=1)
+    whole = (tiles + main) * _layers(config)
+    return whole + _post_filter(config, ways) if config.post_filter else whole
+
+
+def _warp(config: Any) -> Cost:
+    """Return the marks of all splats at all moments, four each, and what is made ready for them."""
+    marks = 4 * config.num_samples * config.supersampling**2
+    ready = Cost(passes=4 if config.background == "none" else 10)
+    return ready + Cost(marks, marks, marks * _TWO_SUMS, passes=1)
+
+
 _TABLE: dict[str, Callable[[Any], Cost]] = {
     "guertin2014": _reconstruction,
     "jimenez2014": _jimenez,
@@ -226,4 +254,6 @@ _TABLE: dict[str, Callable[[Any], Cost]] = {
     "oberberger2022": _oberberger,
     "sousa2013": _sousa,
     "tan2022": _tan,
+    "torchblur": _composed,
+    "warp": _warp,
 }
