@@ -70,6 +70,9 @@ def _print_machine(report: Report) -> None:
         f"{where}; {machine['threads']} threads on {machine['cores']} cores; torch "
         f"{machine['torch']}; commit {machine['commit'] or 'unknown'}"
     )
+    runs = {row.runs for table in report.tables for row in table.rows if row.runs > 1}
+    if runs:
+        text += f"; medians of {min(runs)} to {max(runs)} runs"
     results.print(Text(text, style="dim"), soft_wrap=True)
 
 

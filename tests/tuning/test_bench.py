@@ -341,14 +341,15 @@ class TestPrinting:
 
     def test_rows_are_marked_and_errors_told(self, capsys):
         rows = [
-            Row(case=TINY, cpu_s=0.5, wall_s=0.25, others=1.0),
-            Row(case=TINY.but(filter="sousa2013"), cpu_s=0.125, wall_s=0.1, others=0.1),
+            Row(case=TINY, runs=3, cpu_s=0.5, wall_s=0.25, others=1.0),
+            Row(case=TINY.but(filter="sousa2013"), runs=5, cpu_s=0.125, wall_s=0.1, others=0.1),
             Row(case=TINY.but(filter="tan2022"), error="MemoryError: no room"),
         ]
         fit = LinearFit(name="f", x="N", points=3, intercept=1, slope=2, r2=0.5, residual=0.25)
         print_report(self.report(tables=[Table(name="taps", title="taps", rows=rows, fits=[fit])]))
         captured = capsys.readouterr()
         assert " line* " in captured.out
+        assert "P; 2 threads on 2 cores; torch 9; commit unknown; medians of 3 to 5" in captured.out
         assert " sousa2013 " in captured.out
         assert "500" in captured.out
         assert "tan2022" not in captured.out
