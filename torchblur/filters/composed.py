@@ -42,6 +42,7 @@ from torchblur.ops.weights import power, saturate
 __all__ = ["ComposedBlur", "ComposedConfig", "composed"]
 
 _SHORTEST_REACH = 1e-3  # px; what is shorter has no direction either
+_TRACE = 1e-6  # weight per tap
 _LEVEL = 1e-6  # neighbors whose depths differ by less, as a share, are one surface
 
 
@@ -319,7 +320,8 @@ def _resolve(
 def _over_nothing(sums: list[Sums], values: Values) -> list[Sums]:
     """Return the sums with the front opaque where there is no back."""
     background = torch.stack([one.background for one in sums]).sum(0)
-    shown = (background > 0).to(background.dtype)
+    # Rounding leaves a trace of a back where something arrives at every time.
+    shown = (background > _TRACE).to(background.dtype)
     if values.background_fade > 0:
         shown = saturate(background / values.background_fade, values.softness)
     return [one._replace(alpha=1 - (1 - one.alpha) * shown) for one in sums]

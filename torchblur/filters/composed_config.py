@@ -209,9 +209,9 @@ class ComposedConfig(RevealedBackgroundConfig, ReconstructionConfig):
         meaning="separate: what fills in where no tap shows a back: the front, or the own color",
     )] = "foreground"
     background_fade: Annotated[float, Param(
-        low=0.0, high=1.0, grad="discrete", source=f"0: {_NOTES}",
+        low=0.0, high=1.0, grad="discrete", source=f"0: {_NOTES}; above: {_OURS}",
         meaning="share of the taps up to which a blurred back fades in; 0 is all or nothing",
-    )] = 0.0
+    )] = 0.05
     center_weight: Annotated[bool, Param(
         grad="discrete", source=f"{_GUERTIN}, section 4.3",
         meaning="normalized: give the pixel's own color the weight N / (κ · half spread)",

@@ -1,0 +1,74 @@
+"""torchblur's own filter against its slow twin, and the twin against what is known."""
+
+import pytest
+import torch
+from twins.composed import DEFAULTS, composed
+
+from torchblur.filters.composed import ComposedBlur
+from torchblur.ops.noise import noise_plane
+from torchblur.testing.frames import moving_square, random_frame
+
+CASES = [
+    {},
+    {"num_samples": 5, "tile_size": 7, "refinements": 0},
+    {"match_tolerance": 3.0, "match_slope": 0.2, "refinements": 1, "edge_motion": "own"},
+    {"edge_motion": "surface", "edge_depth": 0.1, "depth_compare": "absolute"},
+    {"resolve": "normalized", "center_taps": 0.7, "center_weight": True, "kappa": 3.0},
+    {"resolve": "normalized", "foreground_gain": 0.4, "background_gain": 3.0},
+    {"missing_background": "center", "background_fade": 0.5, "center_taps": 1.5},
+    {"background_fade": 0.3, "alpha_gain": 0.6, "depth_level": 0.8},
+    {"depth_classes": "independent", "soft_depth_extent": 0.5, "relative_depth_extent": 0.3},
+    {"first_direction": False, "second_direction": False, "color_lookup": "bilinear"},
+    {"own_direction": False, "neighbor_culling": True, "tile_size": 5},
+    {"shutter_position": "leading", "noise": "halton", "seed": 2},
+    {"shutter_position": "trailing", "tile_jitter": 1.5, "noise": "gradient", "tile_size": 9},
+    {"direction_reduction": "hierarchical", "secondary_exponent": 0.6, "tile_size": 6},
+    {"color_lookup": "nearest", "early_out": 1.8, "tile_size": 4},
+]
+
+
+def both(frame, params):
+    blur = ComposedBlur(**params)
+    planes = [
+        noise_plane(blur.config.noise, frame.color, stream, blur.config.seed)[0, 0].numpy()
+        for stream in (0, 1)
+    ]
+    arrays = [plane[0].numpy() for plane in (frame.color, frame.depth, frame.velocity)]
+    settings = blur.config.model_dump(include=set(DEFAULTS))
+    return blur.layers(frame), composed(
+        *arrays, tap_noise=planes[0], tile_noise=planes[1], **settings
+    )
+
+
+def slowed(frame, params):
+    """The frame at speeds within the tiles' reach: the filter chooses before it clamps."""
+    reach = params.get("tile_size", 20) / (1 if "shutter_position" not in params else 2)
+    longest = float(frame.velocity.square().sum(1).sqrt().max()) / 4
+    scale = min(1.0, 0.95 * reach / longest)
+    return frame.map(lambda t: t * scale if t.shape[1] == 2 else t)
+
+
+@pytest.mark.parametrize("params", CASES, ids=str)
+@pytest.mark.parametrize("make_frame", [random_frame, moving_square], ids=["random", "square"])
+def test_filter_equals_its_twin(params, make_frame):
+    frame = slowed(make_frame(13, 16, dtype=torch.float64), params)
+    layers, twin = both(frame, params)
+    for key in ("color", "alpha"):
+        expected = torch.from_numpy(twin[key])[None]
+        # float32 parameters and half-way roundings: a few pixels may take another neighbor.
+        wrong = ((layers[key].detach() - expected).abs() > 2e-5).any(1)
+        assert float(wrong.double().mean()) <= 0.01, key
+    assert not torch.allclose(layers["color"].detach(), frame.color, atol=0.01)
+
+
+def test_the_comparison_can_fail():
+    frame = slowed(random_frame(13, 16, dtype=torch.float64), {})
+    layers, _ = both(frame, {})
+    other = ComposedBlur(match_tolerance=1.3)(frame).detach()
+    wrong = ((other - layers["color"].detach()).abs() > 2e-5).any(1)
+    assert float(wrong.double().mean()) > 0.3
+
+
+def test_the_twin_has_the_defaults_of_the_filter():
+    config = ComposedBlur().config.model_dump()
+    assert {key: config[key] for key in DEFAULTS} == DEFAULTS
