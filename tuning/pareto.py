@@ -313,6 +313,7 @@ def _polished(
     name = f"polished-{job.index}.pt"
     stored = None if folder is None else folder.load_state(name)
     if stored is None:
+        stage.step(0, message=f"gradient steps from {len(chosen)} presets")
         stored = {"found": [_plain(after) for after in _steps(search, chosen, smooth)]}
         if folder is not None:
             folder.save_state(name, stored)
