@@ -11,6 +11,7 @@ from pydantic import Field
 from torchblur.errors import ConfigError, nearest_name
 from torchblur.filters import get_filter, registered_filters
 from torchblur.params import Config
+from torchblur.presets import load_preset
 from tuning.bench_cases import Case, What
 from tuning.bench_work import has_taps, refuse_unknown
 
@@ -286,6 +287,4 @@ _ENGINES = ("eager", "compiled")
 def _kind_has_taps(name: str) -> bool:
     if name in registered_filters():
         return has_taps(get_filter(name))
-    from torchblur.presets import load_preset
-
     return has_taps(get_filter(load_preset(name).filter))

@@ -171,8 +171,8 @@ def _expanded(history: History, count: int) -> History:
 def bench_frame(case: Case, seed: int = 0) -> Frame:
     """Return frames whose middle moves: a rectangle with the case's share of the area.
 
-    There, speeds from 20 to 80 px/frame and directions change smoothly; color, time and depth are
-    noise. All layers that a filter of this library may ask for are there, but what lies behind.
+    There, speeds from 20 to 80 px/frame and directions change smoothly; color, normal, time and
+    depth are noise. All layers that a filter may ask for are there, with a still layer behind.
 
     Args:
         case: Size, batch, share, device.
@@ -188,10 +188,18 @@ def bench_frame(case: Case, seed: int = 0) -> Frame:
     smooth = torch.nn.functional.interpolate(coarse, size, mode="bilinear", align_corners=False)
     speed = _SPEED[0] + (_SPEED[1] - _SPEED[0]) * smooth[:, :1]
     angle = 2 * math.pi * smooth[:, 1:]
-    velocity = torch.cat((speed * angle.cos(), speed * angle.sin()), 1) * _moving_mask(case)
-    normal = torch.nn.functional.normalize(noise(3) - 0.5, dim=1)
+    mask = _moving_mask(case)
+    velocity = torch.cat((speed * angle.cos(), speed * angle.sin()), 1) * mask
     frame = Frame(
-        color=noise(3), velocity=velocity, depth=noise(1) + 1, normal=normal, time=noise(1)
+        color=noise(3),
+        velocity=velocity,
+        depth=noise(1) + 1,
+        normal=torch.nn.functional.normalize(noise(3) - 0.5, dim=1),
+        time=noise(1),
+        object_id=mask.to(torch.int32).expand(case.batch, -1, -1, -1),
+        revealed=Frame(
+            color=noise(3), velocity=torch.zeros_like(velocity), depth=noise(1) + 3, time=noise(1)
+        ),
     )
     return frame.map(lambda plane: plane.to(case.device))
 
