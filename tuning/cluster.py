@@ -95,7 +95,9 @@ class Cluster:
 
     @property
     def width(self) -> int:
-        """How many tasks are worked on at a time."""
+        """How many tasks are worked on at a time; 0 while there is no worker."""
+        if self.client.status != "running":
+            raise ClusterError(f"the scheduler at {self.address} is gone")
         return sum(self.client.nthreads().values())
 
     @property
@@ -188,7 +190,7 @@ class Flight(Generic[T, R]):
     def stop(self) -> int:
         """Send nothing more and take back what no worker has begun; return how many are left."""
         self._waiting.clear()
-        for future in list(self._flying)[self._cluster.width :]:
+        for future in list(self._flying)[max(1, self._cluster.width) :]:
             del self._flying[future]
             future.cancel()
         return len(self._flying)
@@ -200,7 +202,10 @@ class Flight(Generic[T, R]):
         self._flying.clear()
 
     def _launch(self) -> None:
-        room = 2 * self._cluster.width - len(self._flying) if self._waiting else 0
+        if not self._waiting:
+            return
+        # One task waits at the scheduler while there is no worker.
+        room = max(1, 2 * self._cluster.width) - len(self._flying)
         while self._waiting and room > 0:
             position, item = self._waiting.popleft()
             future = self._cluster.client.submit(self._function, item, pure=False, retries=_RETRIES)
@@ -280,7 +285,7 @@ def _start_local(dask: Any, workers: int) -> Any:
     return dask.LocalCluster(
         n_workers=workers,
         threads_per_worker=1,
-        dashboard_address=None,
+        dashboard_address="127.0.0.1:0",
         silence_logs=logging.ERROR,
         env={name: threads for name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS")},
     )

@@ -10,8 +10,8 @@ import dataclasses
 import threading
 import uuid
 import warnings
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager, nullcontext
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager, nullcontext
 from dataclasses import dataclass
 from functools import lru_cache, partial
 from pathlib import Path
@@ -22,7 +22,7 @@ from torchblur.filters import BlurFilter
 from torchblur.ops.compiling import compiler_works
 from torchblur.ops.gather import Engine
 from tuning.apply import FilterSettings, make_filter
-from tuning.cluster import Cluster, ClusterError, Flight, Lost, here, share_cores
+from tuning.cluster import Cluster, ClusterError, Lost, here, share_cores
 from tuning.outputs import Job
 from tuning.runner import Log, Runner, Task
 
@@ -97,19 +97,29 @@ def run_on_cluster(
             probe=probe,
         )
         flight = cluster.start(partial(_make, order), sent)
+        texts: dict[int, tuple[str, ...]] = {}
+        stopped = False
         try:
-            _collect(flight, tasks, log)
+            _collect(flight, tasks, log, texts)
         except KeyboardInterrupt:
+            stopped = True
             log.stopping(flight.stop())
             try:
-                _collect(flight, tasks, log)
+                _collect(flight, tasks, log, texts)
             except KeyboardInterrupt:
                 flight.drop()
-            return True
-    return False
+    for text in dict.fromkeys(text for position in sorted(texts) for text in texts[position]):
+        warnings.warn(text, stacklevel=2)
+    return stopped
 
 
-def _collect(flight: Flight[Task, _Told], tasks: Sequence[Task], log: Log) -> None:
+def _collect(
+    flight: Iterable[tuple[int, _Told | Lost]],
+    tasks: Sequence[Task],
+    log: Log,
+    texts: dict[int, tuple[str, ...]],
+) -> None:
+    """Tell of each frame as its task ends, and keep its warnings."""
     for position, told in flight:
         task = tasks[position]
         if isinstance(told, Lost):
@@ -118,8 +128,7 @@ def _collect(flight: Flight[Task, _Told], tasks: Sequence[Task], log: Log) -> No
                     log.failed(job, told.reason)
             continue
         _refuse_other_disks(told)
-        for text in told.warnings:
-            warnings.warn(text, stacklevel=2)
+        texts[position] = told.warnings
         for index, reason in told.reasons.items():
             if reason is None:
                 log.written(task.jobs[index])
@@ -178,6 +187,7 @@ def _probe(folder: Path) -> Iterator[Path]:
 
 _COMPILED, _HEARING = threading.Lock(), threading.Lock()
 _HEARERS: list[list[str]] = []
+_CATCHER = ExitStack()
 
 
 class _Notes:
@@ -218,7 +228,9 @@ def _heard() -> Iterator[list[str]]:
     """Collect the warnings of this process; `warnings.catch_warnings` is not for threads."""
     texts: list[str] = []
     with _HEARING:
-        if warnings.showwarning is not _hear:
+        if not _HEARERS:
+            _CATCHER.enter_context(warnings.catch_warnings())
+            warnings.simplefilter("always")
             warnings.showwarning = _hear
         _HEARERS.append(texts)
     try:
@@ -226,6 +238,8 @@ def _heard() -> Iterator[list[str]]:
     finally:
         with _HEARING:
             _HEARERS[:] = [other for other in _HEARERS if other is not texts]
+            if not _HEARERS:
+                _CATCHER.close()
 
 
 def _hear(message: Warning | str, *_: Any, **__: Any) -> None:
