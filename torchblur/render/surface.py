@@ -126,8 +126,7 @@ def _layers_of_chunk(
     if change is not None:
         layers["acceleration"] = change
     if radiance:
-        layers["color"] = tracer.radiance(hit)
-        layers["albedo"] = tracer.radiance(hit, lit=False)
+        layers["color"], layers["albedo"] = tracer.radiances(hit)
     return layers
 
 

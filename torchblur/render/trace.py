@@ -2,7 +2,8 @@
 
 One small function is run per body (`_step`) and per kind of texture (`_painter`). They are
 compiled once per kind, not per scene: sizes, motions and colors are rows of tables. Meshes come
-after all other bodies, and are never compiled by torch (`_mesh_step`).
+after all other bodies, and are never compiled by torch (`_mesh_step`). Without the compiler normals
+and textures are computed for the rays alone that need them (`_trace_convex`).
 """
 
 from __future__ import annotations
@@ -175,27 +176,35 @@ class Tracer:
         """Return half width, half height and focal length for an image size, px, (3,)."""
         return lens(self.camera, size).to(self._device, self._dtype)
 
-    def radiance(self, hit: Hit, *, lit: bool = True) -> Tensor:
-        """Return the scene-linear radiance of hits, (3, N).
+    def radiance(self, hit: Hit) -> Tensor:
+        """Return the scene-linear radiance of hits, (3, N)."""
+        return self.radiances(hit)[0]
+
+    def radiances(self, hit: Hit) -> tuple[Tensor, Tensor]:
+        """Return the scene-linear radiance of hits, and the textures' own colors, (3, N) each.
 
         Args:
             hit: From `closest_hit`.
-            lit: False: without the light, the textures' own colors.
         """
-        parts = []
+        lit, own = [], []
         for planes, count in self._chunks(hit.body, *hit.point.unbind(0), *hit.normal.unbind(0)):
-            state = (planes[0], planes[0], planes[1:4], planes[4:7])
-            parts.append(torch.stack([p[:count] for p in self._shade(state, lit)]))  # type: ignore[arg-type]
-        return torch.cat(parts, 1)
+            color = self._painted(planes[0], planes[1:4])  # type: ignore[arg-type]
+            own.append(torch.stack([plane[:count] for plane in color]))
+            color = self._under_light(color, planes[4:7], planes[0])  # type: ignore[arg-type]
+            lit.append(torch.stack([plane[:count] for plane in color]))
+        return torch.cat(lit, 1), torch.cat(own, 1)
 
     def _trace(self, origin: Vec, direction: Vec, time: Tensor) -> _State:
         state = _nothing(direction, len(self.bodies))
         rays = (origin, direction, time)
         tables = list(zip(self.bodies, self.levels, self._shapes, self._numbers, strict=True))
-        for body, levels, shape, number in tables:
-            if isinstance(body, Convex):
+        convex = [row for row in tables if isinstance(row[0], Convex)]
+        if self._compiled:
+            for body, levels, shape, number in convex:
                 step = _step(type(body))
                 state = execute(step, self._compiled, state, rays, levels, shape, number)
+        else:
+            state = _trace_convex(state, rays, convex)
         for (body, levels, _, number), mesh in zip(tables, self._meshes, strict=True):
             if mesh is not None:
                 skin = None if body.texture is None else _SKIN
@@ -203,17 +212,27 @@ class Tracer:
         return state
 
     def _shade(self, state: _State, lit: bool = True) -> Vec:
-        _, body, point, normal = state
+        color = self._painted(state[1], state[2])
+        return self._under_light(color, state[3], state[1]) if lit else color
+
+    def _painted(self, body: Tensor, point: Vec) -> Vec:
         color = _zeros(point)
-        seen = torch.bincount(self._kinds[body], minlength=len(TEXTURES)).tolist()
+        kinds = self._kinds[body]
+        seen = torch.bincount(kinds, minlength=len(TEXTURES)).tolist()
         for kind in (kind for kind, count in enumerate(seen) if count):
-            painter = _painter(kind)
-            tables = (self._kinds, self._paint)
-            color = execute(painter, self._compiled, color, point, body, *tables)
-        if lit:
-            tables = (self._emissive, self._light)
-            color = execute(_lit, self._compiled, color, normal, body, *tables)
+            if self._compiled:
+                tables = (self._kinds, self._paint)
+                color = execute(_painter(kind), True, color, point, body, *tables)
+            else:
+                which = (kinds == kind).nonzero()[:, 0]
+                row = list(self._paint[:, body[which]].unbind(0))
+                _put(color, which, TEXTURES[kind].paint(_at(point, which), row))
         return color
+
+    def _under_light(self, color: Vec, normal: Vec, body: Tensor) -> Vec:
+        tables = (self._emissive, self._light)
+        lit: Vec = execute(_lit, self._compiled, color, normal, body, *tables)
+        return lit
 
     def _chunks(self, *planes: Tensor) -> Iterator[tuple[tuple[Tensor, ...], int]]:
         """Cut planes of N rays into chunks; compiled code takes full ones only."""
@@ -241,6 +260,49 @@ def _nothing(direction: Vec, sky: int) -> _State:
 def _zeros(like: Vec) -> Vec:
     """Return three planes; one tensor thrice would be another case to the compiler."""
     return torch.zeros_like(like[0]), torch.zeros_like(like[1]), torch.zeros_like(like[2])
+
+
+def _at(vectors: Vec, which: Tensor) -> Vec:
+    return vectors[0][which], vectors[1][which], vectors[2][which]
+
+
+def _put(vectors: Vec, which: Tensor, values: Vec) -> None:
+    for plane, value in zip(vectors, values, strict=True):
+        plane[which] = value
+
+
+def _trace_convex(
+    state: _State, rays: tuple[Vec, Vec, Tensor], bodies: Sequence[tuple[Any, Any, Any, Tensor]]
+) -> _State:
+    """Try convex bodies on all rays, as `_step` each; what a ray hits is looked at once, last."""
+    origin, direction, time = rays
+    distance, hit = state[0], state[1]
+    for body, levels, shape, number in bodies:
+        near, far = body.interval(*into(levels, time, origin, direction), shape.unbind(0))
+        here = torch.where(near > _NEAR, near, far)
+        is_closer = (near <= far) & (here > _NEAR) & (here < distance)
+        distance = torch.where(is_closer, here, distance)
+        hit = torch.where(is_closer, number, hit)
+    for body, levels, shape, number in bodies:
+        which = (hit == number).nonzero()[:, 0]
+        if which.numel():
+            own = (_at(origin, which), _at(direction, which), time[which])
+            below, facing = _surface(body, own, levels, shape, distance[which])
+            _put(state[2], which, below)
+            _put(state[3], which, facing)
+    return distance, hit, state[2], state[3]
+
+
+def _surface(
+    kind: Any, rays: tuple[Vec, Vec, Tensor], levels: Tensor, shape: Tensor, distance: Tensor
+) -> tuple[Vec, Vec]:
+    """Return the texture's point and the facing normal where rays hit a body."""
+    origin, direction = into(levels, rays[2], rays[0], rays[1])
+    point = add(origin, scale(direction, distance))
+    normal = kind.normal(point, shape.unbind(0))
+    below = subtract(point, scale(normal, _SKIN))
+    outwards = turn(levels, rays[2], normal)
+    return below, select(dot(normal, direction) > 0, scale(outwards, -1), outwards)
 
 
 @functools.cache
