@@ -33,7 +33,7 @@ def race(
     """
     from tuning.race import run_race
     from tuning.race_config import load_race_config
-    from tuning.race_files import COLUMNS, cells, note_of, write_race
+    from tuning.race_files import COLUMNS, SHORT, cells, note_of, write_race
     from tuning.race_summary import standings
 
     folder = output or Path("runs") / config.stem
@@ -46,10 +46,11 @@ def race(
         raise typer.Exit(_INTERRUPTED) from error
     files = write_race(folder, loaded, curves)
     for problem in loaded.problems:
-        columns = ("method", *COLUMNS)
-        table = plain_table(problem.name, columns, right=COLUMNS)
+        names = tuple(SHORT.values())
+        table = plain_table(problem.name, ("method", *names), right=names)
         for one in standings(loaded, problem, curves):
-            table.add_row(one.entrant, *cells(loaded, one))
+            texts = dict(zip(COLUMNS, cells(loaded, one), strict=True))
+            table.add_row(one.entrant, *(texts[column] for column in SHORT))
         results.print(table)
         results.print(note_of(loaded, problem))
     results.print(f"tables: {folder / 'tables.md'}, {len(files)} files", soft_wrap=True)

@@ -18,7 +18,7 @@ from tuning.race_plots import plot_race
 from tuning.race_summary import NEAR, Standing, standings
 from tuning.study import slug
 
-__all__ = ["COLUMNS", "cells", "note_of", "write_race"]
+__all__ = ["COLUMNS", "SHORT", "cells", "note_of", "write_race"]
 
 COLUMNS = (
     "evaluations",
@@ -31,6 +31,16 @@ COLUMNS = (
     "CPU s until then",
 )
 """Columns of a standing's figures."""
+
+SHORT = {
+    "evaluations": "evaluations",
+    "CPU s": "CPU s",
+    "hold-out": "hold-out",
+    "reached": "reached",
+    "evaluations until then": "after",
+    "CPU s until then": "CPU s",
+}
+"""Those that fit into a terminal, and what they are called there."""
 
 
 def write_race(folder: Path, config: RaceConfig, curves: Sequence[Curve]) -> list[Path]:

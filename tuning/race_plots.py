@@ -43,7 +43,9 @@ def plot_race(
         panels.append((_passes, lambda p: p.distance, "evaluations", label))
     with mpl.rc_context(style()):
         figure = Figure(figsize=(4.6 * len(panels), 4.9), layout="constrained")
-        figure.suptitle(f"{config.title}: {problem.name}, median of {len(config.seeds)} seeds")
+        count = len(config.seeds)
+        seeds = "one seed" if count == 1 else f"median of {count} seeds"
+        figure.suptitle(f"{config.title}: {problem.name}, {seeds}")
         for position, (key, value, across, up) in enumerate(panels):
             axes = figure.add_subplot(1, len(panels), position + 1)
             _draw(axes, curves, key, value)
@@ -76,9 +78,9 @@ def _draw(
         xs, middle, low, high = zip(*found, strict=True)
         line = "-" if index < _COLORS else "--"
         color = color_of(index)
-        axes.plot(xs, middle, line, color=color, linewidth=1.5, label=name)
+        axes.step(xs, middle, line, where="post", color=color, linewidth=1.5, label=name)
         axes.plot(xs[-1:], middle[-1:], "o", color=color, markersize=4)
-        axes.fill_between(xs, low, high, color=color, alpha=0.07, linewidth=0)
+        axes.fill_between(xs, low, high, color=color, alpha=0.07, linewidth=0, step="post")
 
 
 def _passes(point: Point) -> float:
