@@ -110,7 +110,7 @@ class _Search:
     def __init__(self, problem: Problem, job: ParetoJob) -> None:
         self.problem, self.job = problem, job
         self.study = new_study(objectives=_OBJECTIVES)
-        self.first = (*job.first, *_sweep(problem, job))
+        self.first = (*job.first, *_sweep(problem, job, job.first[-1]))
 
     @property
     def drawn(self) -> int:
@@ -126,7 +126,7 @@ class _Search:
         """Draw, evaluate and tell; return the finished trials in order."""
         clock, cpu = time.monotonic(), time.process_time()
         trials = [self._ask(number) for number in range(self.drawn, self._end_of_round())]
-        losses = self._evaluate([self._params(trial) for trial in trials])
+        losses = self.evaluate([self._params(trial) for trial in trials])
         for trial in trials:
             trial.set_user_attr("seconds", (time.monotonic() - clock) / len(trials))
             trial.set_user_attr("cpu_seconds", (time.process_time() - cpu) / len(trials))
@@ -149,13 +149,14 @@ class _Search:
             )
         return found
 
-    def result(self, polished: Sequence[ParetoPoint]) -> MethodResult:
+    def result(self, later: Sequence[ParetoPoint]) -> MethodResult:
         """Return what was found; the preset of the whole run is the best at any cost."""
         job, trials = self.job, self.study.get_trials(deepcopy=False)
-        points = [*self.points(), *polished]
+        points = [*self.points(), *later]
         best = min(points, key=lambda p: (p.objective, p.cost, p.number))
-        steps = 0 if job.method.polish is None else job.method.polish.steps + 1
-        evaluations = len(trials) + steps * len(polished)
+        steps = 0 if job.method.polish is None else job.method.polish.steps
+        polished = sum(point.origin == "polished" for point in later)
+        evaluations = len(trials) + len(later) + steps * polished
         return MethodResult(
             name=job.name,
             kind="pareto",
@@ -166,7 +167,7 @@ class _Search:
             seconds=sum(t.user_attrs["seconds"] for t in trials),
             cpu_seconds=sum(t.user_attrs["cpu_seconds"] for t in trials),
             dropped=len(trials) - len(self._complete()),
-            polished=len(polished),
+            polished=polished,
             importances=self._importances(),
             pareto=ParetoResult(
                 points=tuple(points), front=front_of(points), picks=pick(points, job.method.budgets)
@@ -198,7 +199,7 @@ class _Search:
             suggest(trial, parameter)
         return trial
 
-    def _evaluate(self, candidates: Sequence[Mapping[str, Any]]) -> list[float]:
+    def evaluate(self, candidates: Sequence[Mapping[str, Any]]) -> list[float]:
         """Return the losses; what was evaluated before is not evaluated again."""
         known = {_key(self._params(t)): t.values[0] for t in self._complete()}
         new = {_key(c): c for c in candidates if _key(c) not in known}
@@ -260,12 +261,12 @@ def _log(folder: RunFolder, job: ParetoJob, trial: FrozenTrial) -> None:
 # -- given points ----------------------------------------------------------------------------------
 
 
-def _sweep(problem: Problem, job: ParetoJob) -> list[dict[str, Any]]:
-    """Return the last given point with other values of the parameter that costs the most.
+def _sweep(problem: Problem, job: ParetoJob, start: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """Return a point with other values of the parameter that costs the most.
 
     So the search begins at what one would have without it: the same settings with fewer taps.
     """
-    start = dict(job.first[-1])
+    start = dict(start)
     most: list[Any] = []
     chosen, widest = "", 1.0
     for parameter in job.space.parameters:
@@ -297,8 +298,10 @@ def _polished(
 ) -> list[ParetoPoint]:
     """Go down the gradient from each picked point: its cost stays, its objective falls.
 
+    The best of what comes out is tried at the other costs as well.
+
     Returns:
-        Those that became better.
+        Those that became better, and those tried.
     """
     job, points = search.job, search.points()
     if not points:
@@ -323,7 +326,30 @@ def _polished(
         if params is not None and loss < point.objective:
             cost = cost_at(search.problem.blur, params)
             made.append(make_point(search.drawn + place, "polished", params, loss, cost))
-    return made
+    return [*made, *_swept(search, made, folder)]
+
+
+def _swept(
+    search: _Search, made: Sequence[ParetoPoint], folder: RunFolder | None
+) -> list[ParetoPoint]:
+    """Return the best polished point with other values of what costs the most."""
+    if not made:
+        return []
+    best = min(made, key=lambda p: (p.objective, p.cost))
+    others = _sweep(search.problem, search.job, best.params)
+    name = f"swept-{search.job.index}.pt"
+    stored = None if folder is None else folder.load_state(name)
+    if stored is None:
+        stored = {"losses": search.evaluate(others)}
+        if folder is not None:
+            folder.save_state(name, stored)
+    found = zip(others, stored["losses"], strict=True)
+    first = made[-1].number + 1
+    return [
+        make_point(first + place, "sweep", params, loss, cost_at(search.problem.blur, params))
+        for place, (params, loss) in enumerate(found)
+        if math.isfinite(loss)
+    ]
 
 
 def _steps(

@@ -14,7 +14,7 @@ __all__ = ["Origin", "ParetoPick", "ParetoPoint", "ParetoResult", "front_of", "m
 
 _SLACK = 1e-9  # the budget 1 pays for the filter that defines it, whatever float64 makes of it
 
-Origin = Literal["given", "search", "polished", "published", "start"]
+Origin = Literal["given", "search", "polished", "sweep", "published", "start"]
 
 
 class ParetoPoint(Config):

@@ -125,6 +125,12 @@ class TestPlanted:
             assert after.cost == before.cost
             again = float(planted_problem.mean(after.params))
             assert after.objective == pytest.approx(again, rel=1e-6)
+        # What the steps found is tried at the other costs.
+        best = min(result.pareto.points, key=lambda p: p.objective)
+        swept = [p for p in result.pareto.points if p.origin == "sweep"]
+        (other,) = {3, 11} - {best.params["num_samples"]}
+        assert [p.params for p in swept] == [best.params | {"num_samples": other}]
+        assert swept[0].objective == pytest.approx(float(planted_problem.mean(swept[0].params)))
 
 
 class TestSearch:
