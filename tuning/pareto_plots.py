@@ -19,7 +19,11 @@ __all__ = ["front_png", "front_svg"]
 _GRAY = "#7d8590"
 _DPI = 130
 _TRIAL, _FRONT, _HOLDOUT, _PRESET = _GRAY, color_of(0), color_of(1), color_of(2)
-_MARKS = {"published": ("s", color_of(3)), "start": ("D", color_of(4))}
+_MARKS = {
+    "published": ("as published", "s", color_of(3)),
+    "start": ("start values", "D", color_of(4)),
+    "line": ("line blur", "^", color_of(5)),
+}
 
 
 def front_svg(found: ParetoResult) -> Markup:
@@ -70,8 +74,7 @@ def _steps(axes: Axes, pairs: Sequence[tuple[float, float]], color: str, label: 
 
 
 def _landmark(axes: Axes, mark: ParetoPoint) -> None:
-    name = "as published" if mark.origin == "published" else "start values"
-    shape, color = _MARKS[mark.origin]
+    name, shape, color = _MARKS[mark.origin]
     axes.plot(mark.cost, mark.objective, shape, color=color, markersize=7, label=name)
     if mark.holdout is not None:
         axes.plot(mark.cost, mark.holdout, shape, color=color, markersize=7, fillstyle="none",

@@ -15,7 +15,7 @@ from tuning.result import FitResult
 
 __all__ = ["FrontSection", "front_section", "preset_names"]
 
-_NAMES = {"published": "as published", "start": "start values"}
+_NAMES = {"published": "as published", "start": "start values", "line": "line blur"}
 
 
 @dataclass(frozen=True)

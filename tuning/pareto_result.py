@@ -14,7 +14,7 @@ __all__ = ["Origin", "ParetoPick", "ParetoPoint", "ParetoResult", "front_of", "m
 
 _SLACK = 1e-9  # the budget 1 pays for the filter that defines it, whatever float64 makes of it
 
-Origin = Literal["given", "search", "polished", "sweep", "published", "start"]
+Origin = Literal["given", "search", "polished", "sweep", "published", "start", "line"]
 
 
 class ParetoPoint(Config):
@@ -54,7 +54,7 @@ class ParetoResult(Config):
     """Numbers of the points that no other one beats in both, from the cheapest to the best."""
     picks: tuple[ParetoPick, ...]
     landmarks: tuple[ParetoPoint, ...] = Field(())
-    """The filter as published and, if that differs, the start values."""
+    """The filter as published, the start values if those differ, and a line blur as published."""
 
     def point(self, number: int) -> ParetoPoint:
         """Return a point by its number."""

@@ -65,13 +65,22 @@ def _landmarks(
     problem: Problem, start: Mapping[str, Any], cases: Sequence[AnyCase], holdout: Problem | None
 ) -> tuple[ParetoPoint, ...]:
     blur = problem.blur
-    published = get_filter(blur.name)(engine=blur.engine).to(problem.samples[0].device)
-    published.requires_grad_(False)
-    train = Problem(published, problem.samples, problem.objective)
-    marks = [_mark("published", {}, train, _holdout(train, published, cases))]
-    if type(blur.config).model_validate(blur.config.model_dump() | dict(start)) != published.config:
+    marks = [_as_published(blur.name, "published", problem, cases)]
+    own = type(blur.config).model_validate(blur.config.model_dump() | dict(start))
+    if own != type(blur.config)():
         marks.append(_mark("start", start, problem, holdout))
+    if blur.name != "line":
+        marks.append(_as_published("line", "line", problem, cases))
     return tuple(marks)
+
+
+def _as_published(
+    name: str, origin: Origin, problem: Problem, cases: Sequence[AnyCase]
+) -> ParetoPoint:
+    blur = get_filter(name)(engine=problem.blur.engine).to(problem.samples[0].device)
+    blur.requires_grad_(False)
+    train = Problem(blur, problem.samples, problem.objective)
+    return _mark(origin, {}, train, _holdout(train, blur, cases))
 
 
 def _mark(

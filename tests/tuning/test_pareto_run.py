@@ -93,8 +93,11 @@ def test_front_and_presets_have_the_holdout(run):
     for point in found.points:
         known = point.number in found.front or point in found.picked().values()
         assert (point.holdout is not None) == known
-    published, start = found.landmarks
-    assert (published.origin, published.cost, start.origin) == ("published", 1, "start")
+    published, start, line = found.landmarks
+    assert [m.origin for m in found.landmarks] == ["published", "start", "line"]
+    assert published.cost == 1
+    assert line.cost == cost_of("line").relative
+    assert line.objective != published.objective
     assert published.holdout > 0
     assert start.objective == pytest.approx(result.start_objective)
     assert start.objective == found.point(0).objective
@@ -104,8 +107,8 @@ def test_the_table_has_all_settings(run):
     folder, result = run
     rows = list(csv.DictReader((folder / "pareto.csv").read_text().splitlines()))
     found = result.methods[0].pareto
-    assert len(rows) == len(found.points) + 2
-    assert [r["origin"] for r in rows[:3]] == ["published", "start", "given"]
+    assert len(rows) == len(found.points) + 3
+    assert [r["origin"] for r in rows[:4]] == ["published", "start", "line", "given"]
     on_front = {int(r["number"]) for r in rows if r["front"] == "1"}
     assert on_front == set(found.front)
     by_number = {r["number"]: r for r in rows}
