@@ -79,6 +79,7 @@ class TestDrawing:
     def test_another_body_changes_no_other(self):
         two, three = (draw_scene(family_of({"count": [n, n]}), 3) for n in (2, 3))
         assert three.bodies[:2] == two.bodies
+        assert len({body.position for body in three.bodies}) == 3
         more = [SIMPLE["groups"][0] | {"name": "b"}, SIMPLE["groups"][0]]
         both = draw_scene(family_of(groups=more), 3)
         assert both.bodies[2:] == two.bodies
