@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -104,6 +105,8 @@ def bench(  # noqa: PLR0913 - each argument is an option
         "params": apply_overrides({}, set_ or []),
     }
     options = build(BenchOptions, data, "bench")
+    # Whoever ends the benchmark (a job's time limit) also ends the process that measures.
+    before = signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
         with show_progress() as progress:
             report = run_bench(
@@ -115,8 +118,10 @@ def bench(  # noqa: PLR0913 - each argument is an option
             )
     except KeyboardInterrupt as error:
         kept = "" if json_file is None else f"; what was measured is in {json_file}"
-        print_error(f"stopped (Ctrl-C){kept}")
+        print_error(f"stopped{kept}")
         raise typer.Exit(_INTERRUPTED) from error
+    finally:
+        signal.signal(signal.SIGTERM, before)
     print_report(report)
     if json_file is not None:
         results.print(f"wrote {json_file}", soft_wrap=True)

@@ -2,7 +2,10 @@
 
 import itertools
 import json
+import os
+import subprocess
 import sys
+import time
 
 import pytest
 import torch
@@ -324,6 +327,26 @@ def test_what_was_measured_is_kept_when_stopped(monkeypatch, tmp_path):
     report = Report.model_validate_json(file.read_text())
     assert not report.complete
     assert len(report.tables[0].rows) == 1
+
+
+def test_a_time_limit_ends_the_process_that_measures(tmp_path):
+    child = tmp_path / "child.pid"
+    code = f"import os, time; open({str(child)!r}, 'w').write(str(os.getpid())); time.sleep(60)"
+    main = (
+        "import sys, tuning.bench\n"
+        f"tuning.bench._COMMAND = (sys.executable, '-c', {code!r})\n"
+        "from tuning.cli import main; main()"
+    )
+    args = [sys.executable, "-c", main, "bench", "--quick", "--only", "notes"]
+    with subprocess.Popen(args, stderr=subprocess.PIPE, text=True) as process:
+        while process.poll() is None and not (child.exists() and child.read_text()):
+            time.sleep(0.05)
+        process.terminate()
+        _, errors = process.communicate(timeout=60)
+    assert process.returncode == 130
+    assert "error: stopped" in errors
+    with pytest.raises(ProcessLookupError):
+        os.kill(int(child.read_text()), 0)
 
 
 def test_schema_is_printed():
