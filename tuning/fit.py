@@ -181,7 +181,7 @@ def _evaluate(
         scores=tuple(scores),
         notes=setting.notes + budget_notes(methods),
         seed=setting.config.seed,
-        command=shlex.join([Path(sys.argv[0]).name, *sys.argv[1:]]),
+        command=_command(),
         versions=_versions(),
         seconds=time.monotonic() - began,
     )
@@ -308,6 +308,12 @@ def _versions() -> dict[str, str]:
     return {"python": platform.python_version()} | {
         name: importlib.metadata.version(name) for name in names
     }
+
+
+def _command() -> str:
+    program = Path(sys.argv[0]).name
+    words = ["python", "-m", "tuning"] if program == "__main__.py" else [program]
+    return shlex.join([*words, *sys.argv[1:]])
 
 
 def _data_reporter(progress: Progress | None) -> Any:
