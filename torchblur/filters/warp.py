@@ -44,7 +44,7 @@ class _Options(NamedTuple):
 class _Field(NamedTuple):
     """Which pixels the motion can change, over a batch laid flat, (B · H · W,)."""
 
-    index: Tensor
+    pixels: Tensor
     """Their numbers, (T,)."""
     slot: Tensor
     """Number of each pixel among them; T for the others, (B · H · W + 1,)."""
@@ -128,12 +128,12 @@ def _layers(frame: Frame, values: Values) -> dict[str, Tensor]:
     layers = {
         "color": frame.color,
         "coverage": torch.ones_like(frame.color[:, :1]),
-        "behind": _image(hidden.index, hidden.values[:, _COLOR], frame.color),
+        "behind": _image(hidden.pixels, hidden.values[:, _COLOR], frame.color),
         "behind_known": _image(
-            hidden.index, torch.ones_like(hidden.values[:, :1]), frame.color[:, :1]
+            hidden.pixels, torch.ones_like(hidden.values[:, :1]), frame.color[:, :1]
         ),
     }
-    if field.index.numel() == 0:
+    if field.pixels.numel() == 0:
         return layers
     inputs = _own_splats(frame, path, field, values)
     inputs = _joined(inputs, _hidden_splats(hidden, field, values, frame))
@@ -143,14 +143,16 @@ def _layers(frame: Frame, values: Values) -> dict[str, Tensor]:
     )
     color, coverage = sum_taps(_moment, options, values.num_samples, inputs)
     color, coverage = color / values.num_samples, coverage / values.num_samples
-    own = _rows(frame.color)[field.index].T
-    weight = _listed(values.own_weight, field.index, frame) * _valid(frame).reshape(-1)[field.index]
+    own = _rows(frame.color)[field.pixels].T
+    weight = (
+        _listed(values.own_weight, field.pixels, frame) * _valid(frame).reshape(-1)[field.pixels]
+    )
     total = coverage[:, :-1] + weight
     fill = (color[:, :-1] + weight * own) / torch.where(total > 0, total, 1.0)
     fill = torch.where(total > 0, fill, own)
     filled = color[:, :-1] + (1 - coverage[:, :-1]) * fill
-    moved = _image(field.index, torch.cat((filled, coverage[:, :-1])).T, frame.color)
-    touched = (field.slot[:-1] < field.index.numel()).view_as(layers["coverage"])
+    moved = _image(field.pixels, torch.cat((filled, coverage[:, :-1])).T, frame.color)
+    touched = (field.slot[:-1] < field.pixels.numel()).view_as(layers["coverage"])
     layers["color"] = torch.where(touched, moved[:, :3], frame.color)
     layers["coverage"] = torch.where(touched, moved[:, 3:], layers["coverage"])
     return layers
@@ -188,7 +190,8 @@ def _growth(inputs: Inputs, time: Tensor) -> Tensor:
     """Return by how much a surface has grown in area: det(1 + t ∇v)."""
     xx, yx, xy, yy = inputs["gradient"]
     change = time * (xx + yy) + time * time * (xx * yy - xy * yx)
-    return (1 + inputs["stretch"] * change).clamp(*_STRETCH)
+    grown: Tensor = (1 + inputs["stretch"] * change).clamp(*_STRETCH)
+    return grown
 
 
 def _marks(x: Tensor, y: Tensor, time: Tensor, inputs: Inputs, options: _Options) -> Marks:
@@ -215,7 +218,7 @@ def _sharpened(x: Tensor, y: Tensor, inputs: Inputs) -> Tensor:
     dx, dy = x - x.detach().floor(), y - y.detach().floor()
     along_x, along_y = inputs["bend"].split(3)
     blur = (dx * (1 - dx) * along_x + dy * (1 - dy) * along_y) / 2
-    color = inputs["color"] - inputs["sharpening"] * blur
+    color: Tensor = inputs["color"] - inputs["sharpening"] * blur
     return torch.minimum(torch.maximum(color, inputs["low"]), inputs["high"])
 
 
@@ -278,9 +281,10 @@ def _hidden(frame: Frame, path: Tensor, values: Values, longest: Tensor) -> Hidd
         return guess
     # Where the layer is not valid, its place is taken by the guess.
     assert frame.revealed is not None
-    open_ = ~_valid(frame.revealed).bool().reshape(-1)[guess.index]
+    open_ = ~_valid(frame.revealed).bool().reshape(-1)[guess.pixels]
     return Hidden(
-        torch.cat((known.index, guess.index[open_])), torch.cat((known.values, guess.values[open_]))
+        torch.cat((known.pixels, guess.pixels[open_])),
+        torch.cat((known.values, guess.values[open_])),
     )
 
 
@@ -312,13 +316,13 @@ def _own_splats(frame: Frame, path: Tensor, field: _Field, values: Values) -> In
         "high": high,
         "mass": valid,
     }
-    listed = {name: _rows(plane)[field.index].T for name, plane in planes.items()}
-    return _placed(listed, field.index, values, frame)
+    listed = {name: _rows(plane)[field.pixels].T for name, plane in planes.items()}
+    return _placed(listed, field.pixels, values, frame)
 
 
 def _hidden_splats(hidden: Hidden, field: _Field, values: Values, frame: Frame) -> Inputs:
     """Return the splats of what lies behind, where the motion can change anything."""
-    inside = (field.slot[hidden.index] < field.index.numel()).nonzero().flatten()
+    inside = (field.slot[hidden.pixels] < field.pixels.numel()).nonzero().flatten()
     planes = hidden.values[inside].T
     nothing = torch.zeros_like(planes[:1])
     color, depth = planes[_COLOR], 1 / planes[_INVERSE]
@@ -333,7 +337,7 @@ def _hidden_splats(hidden: Hidden, field: _Field, values: Values, frame: Frame) 
         "high": color,
         "mass": nothing + 1,
     }
-    return _placed(listed, hidden.index[inside], values, frame)
+    return _placed(listed, hidden.pixels[inside], values, frame)
 
 
 def _placed(listed: Inputs, index: Tensor, values: Values, frame: Frame) -> Inputs:
@@ -362,9 +366,9 @@ def _joined(one: Inputs, other: Inputs) -> Inputs:
 
 def _targets(field: _Field, values: Values, frame: Frame) -> Inputs:
     """Return what belongs to the targets; the last of them takes what falls outside."""
-    inputs = {"slot": field.slot, "empty": frame.color.new_zeros(field.index.numel() + 1)}
+    inputs = {"slot": field.slot, "empty": frame.color.new_zeros(field.pixels.numel() + 1)}
     for name, key in (("extent", "depth_extent"), ("gain", "coverage_gain")):
-        value = _listed(getattr(values, key), field.index, frame)
+        value = _listed(getattr(values, key), field.pixels, frame)
         inputs[name] = value if value.ndim == 0 else torch.cat((value, value[-1:]))
     return inputs
 

@@ -31,7 +31,7 @@ _STEPS = ((0, -1), (0, 1), (-1, 0), (1, 0))
 class Hidden(NamedTuple):
     """What lies behind some of the pixels."""
 
-    index: Tensor
+    pixels: Tensor
     """Number of the pixel in the batch, (M,): image · H · W + row · W + column."""
     values: Tensor
     """Its planes, the last of them the inverse depth, (M, C)."""
