@@ -35,7 +35,7 @@ __all__ = [
 
 EngineChoice = Literal["auto", "eager", "compiled"]
 
-_WORTH_COMPILING = {"cpu": 1.5e9, "cuda": 7.5e10}  # taps of pixels; a GPU is 50 times as fast
+_WORTH_COMPILING = {"cpu": 5e8, "cuda": 2.5e10}  # taps of pixels; a GPU is 50 times as fast
 GRADIENT_CALLS = 4
 """How many calls without a gradient take as long as one with it."""
 
@@ -61,9 +61,9 @@ def worth_compiling(work: float, device: torch.device | str = "cpu") -> bool:
     """Return whether an amount of work takes so long that compiling for it pays.
 
     The first compilation takes a core some 15 s for a filter, and as long again for its gradient;
-    what is kept on disk is loaded in 3 s. An eager tap of a pixel takes 60 ns, less where many
-    pixels stand still: the limit is between 30 and 90 s of eager work. The answer does not depend
-    on what is on disk, so that the same work is always done in the same way.
+    what is kept on disk is loaded in 3 s. An eager tap of a pixel takes 60 ns, so the limit is at
+    30 s of eager work, or less where many pixels stand still. The answer does not depend on what
+    is on disk, so that the same work is always done in the same way.
 
     Args:
         work: Pixels times taps times calls; a call with its gradient counts `GRADIENT_CALLS`.

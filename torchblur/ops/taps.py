@@ -188,6 +188,8 @@ class _SumTaps(torch.autograd.Function):
         others = {n: t for n, t in named.items() if n not in wanted}
         totals = {name: torch.zeros_like(t) for name, t in wanted.items()}
         taken = tuple(torch.zeros_like(peak, dtype=torch.bool) for peak in peaks)
+        # Views of other tensors would be another case to the compiler for each shape of those.
+        grads = tuple(grad.clone(memory_format=torch.contiguous_format) for grad in grads)
         indices, number = _indices(ctx.num_samples, _floating(named))
         for index in indices:
             totals, taken = ctx.kernel.pull(
