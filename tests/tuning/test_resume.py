@@ -149,17 +149,18 @@ def test_study_is_the_same_after_a_kill_within_a_trial(planted_problem, tmp_path
         counter = iter(range(1000))
         mean = type(planted_problem).mean
 
-        class Stopping:
-            def mean(self, values):
-                if next(counter) == stop_at:
-                    raise StoppedError
-                return mean(planted_problem, values)
+        def stopping(self, values, count=1):
+            if next(counter) == stop_at:
+                raise StoppedError
+            return mean(self, values, count)
 
         job = BlackBoxJob(
             method=BlackBoxMethod(kind="blackbox", sampler=sampler, trials=12), index=0,
             name=sampler, space=space, fixed={}, first=(space.start(),), seed=4,
         )  # fmt: skip
-        return fit_blackbox(Stopping(), job, RunFolder(path))
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(type(planted_problem), "mean", stopping)
+            return fit_blackbox(planted_problem, job, RunFolder(path))
 
     whole = run(tmp_path / "whole")
     for trial in (0, 4, 3):
