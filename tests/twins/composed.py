@@ -10,13 +10,14 @@ from types import SimpleNamespace
 import numpy as np
 from twins import reconstruction as common
 from twins.notes2025 import tile_of, tiles_of
-from twins.reconstruction import length, sat
+from twins.reconstruction import length, sat, scaled
 
 DEFAULTS = common.DEFAULTS | {
     "num_samples": 16,
     "first_direction": True,
     "own_direction": True,
     "second_direction": True,
+    "reversed_direction": True,
     "refinements": 2,
     "match_tolerance": 1.0,
     "match_slope": 0.0,
@@ -64,6 +65,7 @@ def composed(color, depth, velocity, *, tap_noise=None, tile_noise=None, **chang
             tx, ty = tile_of(x, y, (len(first), len(first[0])), settings)
             pixel = SimpleNamespace(x=x, y=y, color=color, depth=depth, field=field)
             starts = {"first": first[ty][tx], "own": field[y][x], "second": second[ty][tx]}
+            starts["reversed"] = scaled(first[ty][tx], -1)
             if length(first[ty][tx]) <= settings.early_out:
                 image[:, y, x] = color[:, y, x]
             else:

@@ -19,6 +19,7 @@ CASES = [
     {"background_fade": 0.3, "alpha_gain": 0.6, "depth_level": 0.8},
     {"depth_classes": "independent", "soft_depth_extent": 0.5, "relative_depth_extent": 0.3},
     {"first_direction": False, "second_direction": False, "color_lookup": "bilinear"},
+    {"reversed_direction": False, "num_samples": 6},
     {"own_direction": False, "neighbor_culling": True, "tile_size": 5},
     {"shutter_position": "leading", "noise": "halton", "seed": 2},
     {"shutter_position": "trailing", "tile_jitter": 1.5, "noise": "gradient", "tile_size": 9},

@@ -49,10 +49,10 @@ _LEVEL = 1e-6  # neighbors whose depths differ by less, as a share, are one surf
 def composed(frame: Frame, config: ComposedConfig | None = None, **params: Any) -> Tensor:
     """Blur with torchblur's own filter, whose special cases are published ones.
 
-    The taps are times. At time t three samples compete for a pixel at x: those that the tile's
-    dominant motion, its second motion and the pixel's own would bring there, ``S = x − t v``. Each
-    then follows the motion that it finds there instead (`refinements`). Its match says whether
-    it arrives on time, and the nearer hide the others:
+    The taps are times. At time t four samples compete for a pixel at x: those that the tile's
+    dominant motion, the same reversed, its second motion and the pixel's own would bring there,
+    ``S = x − t v``. Each then follows the motion that it finds there instead (`refinements`). Its
+    match says whether it arrives on time, and the nearer hide the others:
 
     ``m = sat(1 − |V_S − v| |t| / (match_tolerance + match_slope |v t|))``,
     ``w_k = m_k Π_j (1 − m_j f_kj)``,  ``f_kj = 1 − sat(level + (Z_j − Z_k) / extent)``.
@@ -228,8 +228,11 @@ def _ways(first: Tensor, second: Tensor, spread: Spread, values: Values) -> dict
         "first": (tile, reach, first),
         "own": (own, own_reach, spread.half),
         "second": (direction(second), length(second), second),
+        "reversed": (-tile, reach, -first),
     }
     wanted = [name for name in along if vars(values)[f"{name}_direction"]] or ["own"]
+    if values.sampling != "times":  # the others look to both sides anyway
+        wanted = [name for name in wanted if name != "reversed"] or ["own"]
     ways = {}
     for name in wanted:
         unit, far, vector = along[name]
@@ -247,6 +250,8 @@ def _lines(
     """Return where each direction is sampled, and how densely if in pairs."""
     pairs = (values.num_samples + 1) // 2
     lines = {}
+    if len(ways) > 1:
+        ways = {name: way for name, way in ways.items() if name != "reversed"}
     for number, (name, way) in enumerate(ways.items()):
         plane, most, used = torch.full_like(way.reach, float(pairs)), pairs, moving
         if number == 0 and values.double_samples and values.sampling == "pairs":
@@ -294,7 +299,7 @@ def _means(
         alpha = alpha * (1 + area)
     alpha = saturate(values.alpha_gain * alpha, values.softness)
     used = line.used.to(alpha.dtype)
-    return Sums(*(plane * used for plane in (*sums, alpha)), torch.zeros_like(alpha))
+    return Sums(*(plane * used for plane in (*sums, alpha, torch.zeros_like(alpha))))
 
 
 # -- color -----------------------------------------------------------------------------------------

@@ -44,6 +44,11 @@ class ComposedConfig(RevealedBackgroundConfig, ReconstructionConfig):
         grad="discrete", source=f"{_NOTES}, Second Blur Direction",
         meaning="taps along the tile's second motion too",
     )] = True
+    reversed_direction: Annotated[bool, Param(
+        grad="discrete", source=_OURS,
+        meaning="times: taps on the other side too: they find what moves against the dominant "
+                "motion",
+    )] = True
     refinements: Annotated[int, Param(
         low=0, high=4, grad="discrete", source=f"{_OURS}, after Bowles 2012",
         meaning="times: how often a tap follows the motion that it found instead of the tile's",
@@ -65,7 +70,7 @@ class ComposedConfig(RevealedBackgroundConfig, ReconstructionConfig):
         low=0.0, high=1.0, grad="weak", source=_OURS,
         meaning="how much nearer, as a share of the depth, a pixel beside must be for that",
     )] = 0.0
-    noise: Annotated[Literal["checkerboard", "gradient", "halton", "none"], Param(
+    noise: Annotated[Literal["checkerboard", "gradient", "halton", "none"], Param(  # type: ignore[assignment]
         grad="discrete", source=f"halton: {_GUERTIN}; checkerboard: {_JIMENEZ}",
         meaning="shift of a pixel's taps: 2x2 dither, interleaved gradient noise, Halton",
     )] = "none"
@@ -79,7 +84,7 @@ class ComposedConfig(RevealedBackgroundConfig, ReconstructionConfig):
         source=f"1: {_GUERTIN}, section 4.2; 1/2: {_JIMENEZ}",
         meaning="how far the tile lookup may stray at the tile's edge, peak to peak",
     )] = 0.0
-    color_lookup: Annotated[ColorLookup, Param(
+    color_lookup: Annotated[ColorLookup, Param(  # type: ignore[assignment]
         grad="discrete", source=f"opportunistic: {_NOTES}; cubic: {_OURS}",
         meaning="lookup of the color; velocity and depth are always nearest",
     )] = "cubic"

@@ -45,7 +45,7 @@ class TapOptions(NamedTuple):
     """Switches of the taps; each set is compiled once."""
 
     directions: tuple[str, ...]
-    """"first", "own", "second": those that take part, in the order of their taps."""
+    """"first", "own", "second", "reversed": those that take part, in the order of their taps."""
     center: int
     refinements: int
     relative_depth: bool
