@@ -10,6 +10,7 @@ ALTERNATE = {"sampling": "alternate", "resolve": "normalized"}
 PAIRS = {"sampling": "pairs"}
 RAMP = PAIRS | {"spread": "ramp"}
 GAPS = {"post_filter": True, "num_samples": 4, "shutter": 1.5}
+NOTES = RAMP | {"missing_background": "center", "edge_motion": "own", "own_direction": False}
 BLEND = ALTERNATE | {"center_direction": "blend"}
 
 
@@ -47,8 +48,8 @@ class TestComposed(FilterContract):
         "tile_jitter": {"noise": "halton", "tile_size": 8},
         "noise": {"tile_size": 8},
         "neighbor_culling": {"tile_size": 5},
-        "direction_reduction": {"tile_size": 5},
-        "secondary_exponent": {"tile_size": 8},
+        "direction_reduction": PAIRS | {"tile_size": 5, "edge_motion": "own"},
+        "secondary_exponent": PAIRS | {"tile_size": 8, "own_direction": False},
         "min_angle": PAIRS | {"tile_size": 4, "own_direction": False},
         "bilinear_min": {"tile_size": 2, "color_lookup": "opportunistic"},
         "color_lookup": {"tile_size": 4},
@@ -65,8 +66,8 @@ class TestComposed(FilterContract):
         **{f"post_{name}": GAPS for name in ("samples", "radius", "alpha", "acceptance")},
         "post_filter": {"num_samples": 4, "shutter": 1.5},
         "post_threshold": GAPS,
-        "post_zero_alpha": GAPS,
-        "post_edges": GAPS,
+        "post_zero_alpha": GAPS | NOTES,
+        "post_edges": GAPS | NOTES,
         "post_tau": GAPS | {"post_acceptance": "soft"},
         "post_center_weight": GAPS,
     }
