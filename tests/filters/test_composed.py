@@ -10,7 +10,12 @@ ALTERNATE = {"sampling": "alternate", "resolve": "normalized"}
 PAIRS = {"sampling": "pairs"}
 RAMP = PAIRS | {"spread": "ramp"}
 GAPS = {"post_filter": True, "num_samples": 4, "shutter": 1.5}
-NOTES = RAMP | {"missing_background": "center", "edge_motion": "own", "own_direction": False}
+NOTES = RAMP | {
+    "third_form": "none",
+    "own_direction": False,
+    "edge_motion": "own",
+    "missing_background": "center",
+}
 BLEND = ALTERNATE | {"center_direction": "blend"}
 
 

@@ -70,10 +70,10 @@ class ComposedConfig(RevealedBackgroundConfig, ReconstructionConfig):
         low=0.0, high=1.0, grad="weak", source=_OURS,
         meaning="how much nearer, as a share of the depth, a pixel beside must be for that",
     )] = 0.0
-    noise: Annotated[Literal["checkerboard", "gradient", "halton", "none"], Param(  # type: ignore[assignment]
+    noise: Annotated[Literal["checkerboard", "gradient", "halton", "none"], Param(
         grad="discrete", source=f"halton: {_GUERTIN}; checkerboard: {_JIMENEZ}",
         meaning="shift of a pixel's taps: 2x2 dither, interleaved gradient noise, Halton",
-    )] = "none"
+    )] = "none"  # type: ignore[assignment]  # more than the base has
     jitter: Annotated[float, Param(
         unit="taps", low=0.0, high=32.0, grad="weak",
         source=f"1: McGuire 2012, {_JIMENEZ}; 2 η φ / N: {_GUERTIN}",
@@ -84,10 +84,10 @@ class ComposedConfig(RevealedBackgroundConfig, ReconstructionConfig):
         source=f"1: {_GUERTIN}, section 4.2; 1/2: {_JIMENEZ}",
         meaning="how far the tile lookup may stray at the tile's edge, peak to peak",
     )] = 0.0
-    color_lookup: Annotated[ColorLookup, Param(  # type: ignore[assignment]
+    color_lookup: Annotated[ColorLookup, Param(
         grad="discrete", source=f"opportunistic: {_NOTES}; cubic: {_OURS}",
         meaning="lookup of the color; velocity and depth are always nearest",
-    )] = "cubic"
+    )] = "cubic"  # type: ignore[assignment]  # more than the base has
     bilinear_min: Annotated[float, Param(
         unit="px", low=0.0, high=8.0, grad="weak", source=_NOTES,
         meaning="least half spread in the 3x3 tiles at which the whole tile counts as moving",
