@@ -41,7 +41,7 @@ lint: $(VENV)/.dev
 	$(BIN)/lint-imports
 
 bench: $(VENV)/.tune
-	$(BIN)/python -m tuning.bench
+	$(BIN)/torchblur bench
 
 images: $(VENV)/.tune
 	$(BIN)/python -m tuning.pictures

@@ -237,6 +237,15 @@ class Frame:
 
     # -- other frames --------------------------------------------------------------------------
 
+    def only(self, *names: str) -> Frame:
+        """Return the frame with these layers of it alone, and color and velocity."""
+        frame = object.__new__(Frame)
+        kept = {"color", "velocity", "source", *names}
+        for field in dataclasses.fields(self):
+            value = getattr(self, field.name) if field.name in kept else None
+            object.__setattr__(frame, field.name, value)
+        return frame
+
     def map(self, function: Callable[[Tensor], Tensor]) -> Frame:
         """Return the frame with a function applied to each layer, `revealed` included.
 

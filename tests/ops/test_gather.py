@@ -2,6 +2,7 @@ import pytest
 import torch
 
 from torchblur.ops.gather import gather, lookup, pixel_grid, read, weighted
+from torchblur.ops.pixels import PixelList
 
 
 @pytest.mark.parametrize("mode", ["nearest", "bilinear"])
@@ -53,11 +54,12 @@ def expected(inputs, num_samples, mode):
 @pytest.mark.parametrize("share", [None, 0.0, 0.3, 1.0])
 def test_lists_of_pixels_give_what_images_give(mode, batch_size, sets, share):
     inputs = make_inputs(batch_size, sets)
-    active = None
+    active = pixels = None
     if share is not None:
         active = torch.rand(batch_size, 1, 5, 9, generator=torch.Generator().manual_seed(1)) < share
+        pixels = PixelList.where(active)
     results = []
-    for run in (lambda i: gather(tap, mode, 6, i, active=active), lambda i: expected(i, 6, mode)):
+    for run in (lambda i: gather(tap, mode, 6, i, active=pixels), lambda i: expected(i, 6, mode)):
         leaves = {k: v.clone().requires_grad_() for k, v in inputs.items()}
         wanted = 1.0 if active is None else active.double()
         color, weight = (plane * wanted for plane in run(leaves))
@@ -86,7 +88,7 @@ def test_what_is_not_active_is_zero_and_not_computed():
     inputs = make_inputs()
     active = torch.zeros(1, 1, 5, 9, dtype=torch.bool)
     active[..., 2, 4:7] = True
-    color, _ = gather(counting, None, 2, inputs, active=active)
+    color, _ = gather(counting, None, 2, inputs, active=PixelList.where(active))
     assert set(seen) == {3}
     assert torch.equal(color[..., 2, 4:7], 2 * inputs["texture"][..., 2, 4:7])
     assert not color[..., 0, :].any()
@@ -98,7 +100,8 @@ def test_one_kernel_serves_all_sizes_batches_and_shares_of_active_pixels():
     before = torch._dynamo.utils.counters["stats"]["unique_graphs"]
     few = torch.zeros(1, 1, 5, 9, dtype=torch.bool)
     few[..., 1:3, 2:6] = True
-    for given, active in ((inputs, few), (make_inputs(1, dtype=torch.float32), None)):
+    some = PixelList.where(few)
+    for given, active in ((inputs, some), (make_inputs(1, dtype=torch.float32), None)):
         result = gather(tap, "nearest", 5, given, "compiled", active=active)
         assert torch.allclose(result[0], gather(tap, "nearest", 5, given, active=active)[0])
     batch = make_inputs(3, dtype=torch.float32) | {"decay": torch.tensor(0.4)}

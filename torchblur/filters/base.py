@@ -83,6 +83,9 @@ class BlurFilter(ConfiguredModule):
     config: FilterConfig
     needs: ClassVar[tuple[str, ...]] = ()
     """Layers without which the filter cannot run, beside color and velocity."""
+    per_frame: ClassVar[tuple[str, ...] | None] = None
+    """Parameters of which each value needs a frame of its own; sets of all others share what they
+    can of one frame. None: all parameters."""
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
         super().__init_subclass__(**kwargs)
@@ -117,13 +120,12 @@ class BlurFilter(ConfiguredModule):
             **overrides: Values of parameters for this call.
 
         Returns:
-            "color" (B, 3, H, W), and what the filter adds: its class says what.
+            "color" (B, 3, H, W), and what the filter adds: its class says what. What is the same
+            for a whole batch of parameter values may have a batch of one.
         """
-        values = self.values_for(frame.color, overrides)
-        batch_size = batch_size_of(values, frame.batch_size)
-        if batch_size != frame.batch_size:
-            frame = frame.expand(batch_size)
-        return self.compute(frame, values)
+        frame, values = self._prepared(frame, overrides)
+        layers = self.compute(frame, values)
+        return layers | {"color": _one_per_set(layers["color"], values)}
 
     def engine_for(self, pixels: float) -> Engine:
         """Return the engine that suits an amount of work; the given one unless it is "auto".
@@ -151,7 +153,24 @@ class BlurFilter(ConfiguredModule):
             frame: Frames to blur.
             **overrides: Values of parameters for this call.
         """
-        return self.layers(frame, **overrides)["color"]
+        frame, values = self._prepared(frame, overrides)
+        return _one_per_set(self.color(frame, values), values)
+
+    def color(self, frame: Frame, values: Values) -> Tensor:
+        """Return "color" of `compute`; a filter may have a shorter way to it."""
+        return self.compute(frame, values)["color"]
+
+    def _prepared(self, frame: Frame, overrides: dict[str, Any]) -> tuple[Frame, Values]:
+        values = self.values_for(frame.color, overrides)
+        given = vars(values)
+        per_frame = given if self.per_frame is None else {k: given[k] for k in self.per_frame}
+        batch_size = batch_size_of(Values(**per_frame), frame.batch_size)
+        return frame if batch_size == frame.batch_size else frame.expand(batch_size), values
+
+
+def _one_per_set(color: Tensor, values: Values) -> Tensor:
+    """Return one color for each set of parameters, also of those that change nothing."""
+    return color.expand(batch_size_of(values, color.shape[0]), -1, -1, -1)
 
 
 @dataclass(frozen=True, eq=False)

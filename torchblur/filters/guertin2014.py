@@ -10,21 +10,25 @@ from torch import Tensor
 from torchblur.filters.base import BlurFilter, Values
 from torchblur.filters.reconstruction import (
     WEIGHT_PARAMETERS,
+    Filtered,
+    Moving,
     ReconstructionConfig,
     Spread,
+    Stray,
     Tap,
     is_one,
+    moving_part,
     resolve,
+    revealed_part,
     sample,
-    spread_of,
-    texture_of,
+    tiles_of,
 )
-from torchblur.filters.revealed import RevealedBackgroundConfig, revealed_inputs
+from torchblur.filters.revealed import RevealedBackgroundConfig
 from torchblur.frame import Frame, Shutter
 from torchblur.ops.color import luma
-from torchblur.ops.gather import Engine, Inputs, Lookup, Planes, gather, pixel_grid, weighted
+from torchblur.ops.gather import Engine, Inputs, Lookup, Planes, gather_lists, weighted
 from torchblur.ops.noise import checkerboard, noise_plane
-from torchblur.ops.tiles import tile_lookup, tile_offset, tile_variance
+from torchblur.ops.tiles import tile_lookup, tile_variance
 from torchblur.ops.velocity import direction, length
 from torchblur.ops.weights import cone, cylinder, depth_weights, power, saturate
 from torchblur.params import Param
@@ -208,59 +212,64 @@ class Guertin2014Blur(BlurFilter):
 
     `layers` adds "luma" for an anti-aliasing pass (B, 1, H, W), "tile_max" and "neighbor_max"
     (half spread in px, (B, 2, Ty, Tx)), "tile_variance" ((B, 1, Ty, Tx), if taps are assigned by
-    it) and "weight" (the sum of all weights, (B, 1, H, W)).
+    it) and "weight" (the sum of all weights, (B, 1, H, W); 0 where nothing moves).
     """
 
     name = "guertin2014"
     config_class = Guertin2014Config
+    per_frame = ("shutter",)
 
     def compute(self, frame: Frame, values: Values) -> dict[str, Tensor]:
         """Return "color", "luma", "weight" and the tiles."""
-        return _layers(frame, values, self.engine)
+        layers = _filtered(frame, values, self.engine).layers(frame)
+        moving = layers.pop("moving") > 0
+        return layers | {"luma": _luma(frame, moving, values.luma, layers["color"])}
+
+    def color(self, frame: Frame, values: Values) -> Tensor:
+        """Return the blurred color alone, (B, 3, H, W)."""
+        return _filtered(frame, values, self.engine).color(frame)
 
 
-def _layers(frame: Frame, values: Values, engine: Engine) -> dict[str, Tensor]:
-    spread, tiles = spread_of(
-        frame, values, uint8=values.velocity_encoding == "uint8", cull=values.neighbor_culling
-    )
-    layers = {"tile_max": tiles.own, "neighbor_max": tiles.neighborhood}
-    noise = noise_plane(values.noise, frame.color, 0, values.seed)
-    offset = None
-    if values.stochastic_tiles:
-        shift = noise_plane(values.noise, frame.color, 1, values.seed)
-        offset = tile_offset(frame.color, shift, values.tile_size, values.tau)
-    dominant = tile_lookup(layers["neighbor_max"], frame.color, values.tile_size, offset)
-    inputs = _tap_inputs(frame, spread, dominant, values)
-    inputs["jitter"] = (2 * noise - 1) * values.eta * values.phi / values.num_samples
+def _filtered(frame: Frame, values: Values, engine: Engine) -> Filtered:
+    uint8 = values.velocity_encoding == "uint8"
+    own, around = tiles_of(frame, values, uint8=uint8, cull=values.neighbor_culling)
+    tiles = {"tile_max": own, "neighbor_max": around}
     if values.sample_assignment == "variance":
-        layers["tile_variance"] = tile_variance(tiles.own, _per_image(values.min_length))
-        inputs["variance"] = tile_lookup(
-            layers["tile_variance"], frame.color, values.tile_size, bilinear=True
-        )
-    inputs |= revealed_inputs(frame, values, lambda f, v: _layers(f, v, engine)["color"])
-    sums = gather(_tap, _options(values), values.num_samples, inputs, engine)
-    center_weight = values.num_samples / (values.kappa * inputs["length_p"])
+        tiles["tile_variance"] = tile_variance(own, _per_image(values.min_length))
+    stray = Stray(values.noise, values.tau) if values.stochastic_tiles else None
+    part = moving_part(frame, values, around, stray=stray, uint8=uint8)
+    if part is None:
+        return Filtered.still(frame, tiles, "weight", "moving")
+    inputs = _tap_inputs(part, tiles.get("tile_variance"))
+    inputs |= revealed_part(
+        frame, values, part.pixels, lambda f, v: _filtered(f, v, engine).color(f)
+    )
+    sums = gather_lists(_tap, _options(values), values.num_samples, inputs, part.pixels, engine)
+    center_weight = values.num_samples / (part.values.kappa * inputs["length_p"])
     if not values.center_weight:
         center_weight = torch.zeros_like(center_weight)
-    moving = inputs["reach"] > values.early_out
-    layers["color"], layers["weight"] = resolve(frame, sums, center_weight, moving)
-    layers["luma"] = _luma(frame, moving, values.luma, layers["color"])
-    return layers
+    moving = inputs["reach"] > part.values.early_out
+    color, weight = resolve(part.frame, sums, center_weight, moving)
+    lists = {"color": color, "weight": weight * moving, "moving": moving.to(frame.dtype)}
+    return Filtered(tiles, part.pixels, lists)
 
 
-def _tap_inputs(frame: Frame, spread: Spread, dominant: Tensor, values: Values) -> Inputs:
-    x, y = pixel_grid(frame.color)
-    w_n = direction(dominant)
+def _tap_inputs(part: Moving, variance: Tensor | None) -> Inputs:
+    frame, values, spread, pixels = part.frame, part.values, part.spread, part.pixels
+    x, y = part.grid()
+    w_n = direction(part.dominant)
+    noise = noise_plane(values.noise, frame.color, 0, values.seed, pixels)
     length_p = torch.maximum(spread.length, values.min_length)
     w_c = center_direction(w_n, spread, length_p, values)
     against_tile = power((w_c * w_n).sum(1, keepdim=True).abs(), values.direction_exponent)
     inputs = {
-        "texture": texture_of(frame, spread),
+        "texture": part.texture,
         "x": x,
         "y": y,
         "w_n": w_n,
         "w_c": w_c,
-        "reach": length(dominant),
+        "reach": length(part.dominant),
+        "jitter": (2 * noise - 1) * values.eta * values.phi / values.num_samples,
         "depth": frame.finite_depth(),
         "half": spread.half,
         "length": spread.length,
@@ -274,6 +283,10 @@ def _tap_inputs(frame: Frame, spread: Spread, dominant: Tensor, values: Values) 
         if values.depth_compare == "relative"
         else values.soft_depth_extent,
     }
+    if variance is not None:
+        inputs["variance"] = tile_lookup(
+            variance, frame.color, values.tile_size, bilinear=True, pixels=pixels
+        )
     for key in (*WEIGHT_PARAMETERS, "direction_exponent"):
         inputs[key] = getattr(values, key)
     return inputs
@@ -331,7 +344,7 @@ def _tap(index: Tensor, count: Tensor, inputs: Inputs, options: _Options) -> tup
     t = (2 * (index + 1 + inputs["jitter"]) / (count + 1) - 1).clamp(-1, 1)
     d, reach, own = inputs["w_n"], inputs["reach"], inputs["own_n"]
     if options.two_directions:
-        along_center = _takescenter_direction(index, inputs, options)
+        along_center = _takes_center_direction(index, inputs, options)
         d = torch.where(along_center, inputs["w_c"], d)
         own = torch.where(along_center, inputs["own_c"], own)
         if options.own_length:
@@ -343,10 +356,11 @@ def _tap(index: Tensor, count: Tensor, inputs: Inputs, options: _Options) -> tup
     return weighted(weight, tap.color), weight if tap.valid is None else weight * tap.valid
 
 
-def _takescenter_direction(index: Tensor, inputs: Inputs, options: _Options) -> Tensor:
+def _takes_center_direction(index: Tensor, inputs: Inputs, options: _Options) -> Tensor:
     if options.by_variance:
-        return torch.remainder((index + 0.5) * _GOLDEN, 1.0) < inputs["variance"]
-    return torch.remainder(index, 2) == 1
+        position = (index + 0.5) * _GOLDEN
+        return position - position.floor() < inputs["variance"]
+    return index - 2 * (index / 2).floor() == 1
 
 
 def _weight(

@@ -8,13 +8,24 @@ import torch
 from torch import Tensor
 
 from torchblur.filters.base import BlurFilter, Values
-from torchblur.filters.reconstruction import Spread, Tap, Tiles, sample, spread_of, texture_of
-from torchblur.filters.revealed import RevealedBackgroundConfig, revealed_inputs
+from torchblur.filters.reconstruction import (
+    Filtered,
+    Moving,
+    Stray,
+    Tap,
+    moving_part,
+    pixel_spread,
+    revealed_part,
+    sample,
+    tiles_of,
+)
+from torchblur.filters.revealed import RevealedBackgroundConfig
 from torchblur.frame import Frame, Shutter
-from torchblur.ops.gather import Engine, Inputs, Lookup, Planes, gather, pixel_grid, weighted
+from torchblur.ops.gather import Engine, Inputs, Lookup, Planes, gather_lists, weighted
 from torchblur.ops.noise import NoiseKind, dither_2x2, noise_plane
+from torchblur.ops.pixels import select
 from torchblur.ops.spread import Mirror, SpreadForm, TapPair, depth_shares, mirror, spread_weight
-from torchblur.ops.tiles import neighbor_min, tile_lookup, tile_min, tile_offset
+from torchblur.ops.tiles import neighbor_min, tile_lookup, tile_min
 from torchblur.ops.velocity import direction, length, quantize_uint8
 from torchblur.params import Param
 
@@ -171,10 +182,10 @@ def jimenez2014(frame: Frame, config: Jimenez2014Config | None = None, **params:
     Border: replicated.
     Reference: Jimenez 2014, "Next Generation Post Processing in Call of Duty: Advanced Warfare";
         the slides are not public, the formulas are those on which public ports agree. We differ:
-        the tile lookup is jittered along one axis and near edges only; classes are masks, which
-        change no cost, and the fast one asks for more than the ports do (with their 1/4 what
-        moves another way is blurred wrongly); shutters that are not centered shift the taps
-        along the velocity.
+        the tile lookup is jittered along one axis and near edges only; pixels, not tiles, have a
+        class, that of the tile that they look up; the fast one asks for more than the ports do
+        (with their 1/4 what moves another way is blurred wrongly); shutters that are not
+        centered shift the taps along the velocity.
     Raises: ConfigError for a bad parameter, FrameError if the frame has no depth.
     """
     result: Tensor = Jimenez2014Blur(config, **params)(frame)
@@ -192,23 +203,31 @@ class Jimenez2014Blur(BlurFilter):
 
     name = "jimenez2014"
     config_class = Jimenez2014Config
+    per_frame = ("shutter", "early_out", "fast_ratio", "tile_jitter")
 
     def compute(self, frame: Frame, values: Values) -> dict[str, Tensor]:
         """Return "color", "alpha", "tile_class" and the tiles."""
-        return _layers(frame, values, self.engine)
+        return _filtered(frame, values, self.engine).layers(frame)
+
+    def color(self, frame: Frame, values: Values) -> Tensor:
+        """Return the blurred color alone, (B, 3, H, W)."""
+        return _filtered(frame, values, self.engine).color(frame)
 
 
-def _layers(frame: Frame, values: Values, engine: Engine) -> dict[str, Tensor]:
-    spread, tiles = spread_of(frame, values, cull=values.neighbor_culling)
+def _filtered(frame: Frame, values: Values, engine: Engine) -> Filtered:
+    own, around = tiles_of(frame, values, cull=values.neighbor_culling)
     if values.tile_encoding == "uint8":
-        tiles = Tiles(*(quantize_uint8(tile, values.tile_size) for tile in tiles))
-    shortest = neighbor_min(tile_min(spread.length, values.tile_size))
-    offset = _tile_offset(frame.color, values)
-    dominant = tile_lookup(tiles.neighborhood, frame.color, values.tile_size, offset)
-    least = tile_lookup(shortest, frame.color, values.tile_size, offset)
-    tile_class = _tile_class(length(dominant), least, values)
-    inputs = _tap_inputs(frame, spread, dominant, tile_class == 1, values)
-    inputs |= revealed_inputs(frame, values, lambda f, v: _layers(f, v, engine)["color"])
+        own, around = (quantize_uint8(tile, values.tile_size) for tile in (own, around))
+    shortest = neighbor_min(tile_min(pixel_spread(frame, values).length, values.tile_size))
+    tiles = {"tile_max": own, "neighbor_max": around, "tile_min": shortest}
+    kind: NoiseKind = "gradient" if values.noise == "checkerboard" else values.noise
+    part = moving_part(frame, values, around, stray=Stray(kind, values.tile_jitter))
+    if part is None:
+        return Filtered.still(frame, tiles, "alpha", "tile_class")
+    inputs, tile_class = _tap_inputs(part, shortest)
+    inputs |= revealed_part(
+        frame, values, part.pixels, lambda f, v: _filtered(f, v, engine).color(f)
+    )
     options = _Options(
         Shutter(1, values.shutter_position).center,
         values.depth_compare == "relative",
@@ -218,21 +237,47 @@ def _layers(frame: Frame, values: Values, engine: Engine) -> dict[str, Tensor]:
         values.color_lookup,
     )
     pairs = (values.num_samples + 1) // 2
-    color, alpha = (total / (2 * pairs) for total in gather(_pair, options, pairs, inputs, engine))
-    return {
-        "color": torch.where(tile_class > 0, _fill(frame, color, alpha), frame.color),
+    sums = _sums(part, tile_class, options, pairs, inputs, engine)
+    color, alpha = (total / (2 * pairs) for total in sums)
+    lists = {
+        "color": torch.where(tile_class > 0, _fill(part.frame, color, alpha), part.frame.color),
         "alpha": torch.where(tile_class > 0, alpha, 0.0),
         "tile_class": tile_class,
-        "tile_max": tiles.own,
-        "neighbor_max": tiles.neighborhood,
-        "tile_min": shortest,
     }
+    return Filtered(tiles, part.pixels, lists)
 
 
-def _tile_offset(color: Tensor, values: Values) -> Tensor:
-    kind: NoiseKind = "gradient" if values.noise == "checkerboard" else values.noise
-    noise = noise_plane(kind, color, 1, values.seed)
-    return tile_offset(color, noise, values.tile_size, values.tile_jitter)
+def _sums(
+    part: Moving, tile_class: Tensor, options: _Options, pairs: int, inputs: Inputs, engine: Engine
+) -> tuple[Tensor, Tensor]:
+    """Return sums of color and weight: of weighed taps in the full class, of plain in the fast.
+
+    Args:
+        part: The pixels.
+        tile_class: Of each pixel, (1, 1, 1, M).
+        options: Of the taps.
+        pairs: Number of pairs.
+        inputs: Of the taps, as lists.
+        engine: Of the gathers.
+    """
+    color = alpha = tile_class.new_zeros(())
+    pixels = part.pixels
+    for number, tap in ((1, _plain_pair), (2, _pair)):
+        chosen = (tile_class == number).flatten().nonzero()[:, 0]
+        if chosen.shape[0] == 0 and (number == 1 or color.ndim):
+            continue
+        some = {
+            name: select(plane, chosen)
+            if not name.startswith("texture") and plane.shape[3:] == (pixels.count,)
+            else plane
+            for name, plane in inputs.items()
+        }
+        sums = gather_lists(tap, options, pairs, some, pixels.some(chosen), engine)
+        color, alpha = (
+            whole + new.new_zeros(*new.shape[:3], pixels.count).index_copy(3, chosen, new)
+            for whole, new in zip((color, alpha), sums, strict=True)
+        )
+    return color, alpha
 
 
 def _tile_class(longest: Tensor, shortest: Tensor, values: Values) -> Tensor:
@@ -244,29 +289,31 @@ def _tile_class(longest: Tensor, shortest: Tensor, values: Values) -> Tensor:
     return torch.where(static, 0.0, torch.where(fast, 1.0, 2.0)).to(longest.dtype)
 
 
-def _tap_inputs(
-    frame: Frame, spread: Spread, dominant: Tensor, fast: Tensor, values: Values
-) -> Inputs:
-    x, y = pixel_grid(frame.color)
+def _tap_inputs(part: Moving, shortest: Tensor) -> tuple[Inputs, Tensor]:
+    """Return what the taps look at, and the class of each pixel's tile."""
+    color, values, pixels = part.frame.color, part.values, part.pixels
+    least = tile_lookup(shortest, color, values.tile_size, part.tile_shift, pixels=pixels)
+    reach = length(part.dominant)
+    tile_class = _tile_class(reach, least, values)
+    x, y = part.grid()
     if values.noise == "checkerboard":
-        shift = dither_2x2(frame.color)
+        shift = dither_2x2(color, pixels)
     else:
-        shift = noise_plane(values.noise, frame.color, 0, values.seed) - 0.5
+        shift = noise_plane(values.noise, color, 0, values.seed, pixels) - 0.5
     inputs = {
-        "texture": texture_of(frame, spread),
+        "texture": part.texture,
         "x": x,
         "y": y,
         "shift": shift * values.jitter,
-        "direction": direction(dominant),
-        "reach": length(dominant).clamp_min(_SHORTEST_REACH),
-        "depth": frame.finite_depth(),
-        "half": spread.half,
-        "length": spread.length,
-        "fast": fast.to(frame.dtype),
+        "direction": direction(part.dominant),
+        "reach": reach.clamp_min(_SHORTEST_REACH),
+        "depth": part.frame.finite_depth(),
+        "half": part.spread.half,
+        "length": part.spread.length,
     }
     for key in ("depth_scale", "depth_level", "spread_offset", "spread_slope"):
         inputs[key] = getattr(values, key)
-    return inputs
+    return inputs, tile_class
 
 
 def _fill(frame: Frame, color: Tensor, alpha: Tensor) -> Tensor:
@@ -279,9 +326,7 @@ def _fill(frame: Frame, color: Tensor, alpha: Tensor) -> Tensor:
 
 
 def _pair(index: Tensor, count: Tensor, inputs: Inputs, options: _Options) -> tuple[Planes, Tensor]:
-    step = (index + 0.5) / count
-    shift = inputs["shift"] / count
-    times = TapPair(*((side * step + shift).clamp(-1, 1) for side in (1, -1)))
+    times = _times(index, count, inputs)
     taps, weights = zip(*(_tap(t, count, inputs, options) for t in times), strict=True)
     mirrored = mirror(
         TapPair(*weights),
@@ -289,19 +334,42 @@ def _pair(index: Tensor, count: Tensor, inputs: Inputs, options: _Options) -> tu
         TapPair(*(tap.length for tap in taps)),
         options.mirror,
     )
-    fast = inputs["fast"] > 0
-    used = [torch.where(fast, 1.0, weight) for weight in mirrored]
-    colors = (weighted(u, tap.color) for u, tap in zip(used, taps, strict=True))
-    totals = (u if t.valid is None else u * t.valid for u, t in zip(used, taps, strict=True))
+    colors = (weighted(w, tap.color) for w, tap in zip(mirrored, taps, strict=True))
+    totals = (w if t.valid is None else w * t.valid for w, t in zip(mirrored, taps, strict=True))
     return tuple(a + b for a, b in zip(*colors, strict=True)), torch.add(*totals)
+
+
+def _plain_pair(
+    index: Tensor, count: Tensor, inputs: Inputs, options: _Options
+) -> tuple[Planes, Tensor]:
+    """Return color and weight of two taps that count alike, whatever their depth and motion."""
+    taps = [_look(time, inputs, options)[0] for time in _times(index, count, inputs)]
+    ones = torch.ones_like(taps[0].length)
+    totals = (ones if tap.valid is None else tap.valid for tap in taps)
+    colors = (tap.color for tap in taps)
+    return tuple(a + b for a, b in zip(*colors, strict=True)), torch.add(*totals)
+
+
+def _times(index: Tensor, count: Tensor, inputs: Inputs) -> TapPair:
+    """Return when a pair of taps lies, in units of the reach."""
+    step = (index + 0.5) / count
+    shift = inputs["shift"] / count
+    return TapPair(*((side * step + shift).clamp(-1, 1) for side in (1, -1)))
+
+
+def _look(time: Tensor, inputs: Inputs, options: _Options) -> tuple[Tap, Tensor]:
+    """Return what lies at a time, and how far along the tile's motion that is, px."""
+    along = (time + options.center) * inputs["reach"]
+    dx, dy = inputs["direction"].split(1, 1)
+    x, y = inputs["x"] - along * dx, inputs["y"] - along * dy
+    return sample(inputs, x, y, options.color_lookup), along
 
 
 def _tap(t: Tensor, count: Tensor, inputs: Inputs, options: _Options) -> tuple[Tap, Tensor]:
     """Return what lies at time t, in units of the reach, and its weight."""
-    reach, d = inputs["reach"], inputs["direction"]
-    along = (t + options.center) * reach
+    tap, along = _look(t, inputs, options)
+    d = inputs["direction"]
     dx, dy = d.split(1, 1)
-    tap = sample(inputs, inputs["x"] - along * dx, inputs["y"] - along * dy, options.color_lookup)
     distance_s = distance_p = along.abs()
     if options.center:
         moved_p = (inputs["half"] * d).sum(1, keepdim=True)
@@ -316,7 +384,7 @@ def _tap(t: Tensor, count: Tensor, inputs: Inputs, options: _Options) -> tuple[T
         relative=options.relative_depth,
         softness=options.softness,
     )
-    per_px = count / reach
+    per_px = count / inputs["reach"]
     weight = share.background * _spread_weight(
         distance_p, inputs["length"], per_px, inputs, options
     )

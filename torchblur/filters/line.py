@@ -9,7 +9,8 @@ from torch import Tensor
 
 from torchblur.filters.base import BlurFilter, FilterConfig, Values
 from torchblur.frame import LONGEST_SHUTTER, Frame, Shutter
-from torchblur.ops.gather import Engine, Inputs, Lookup, Planes, gather, pixel_grid, read
+from torchblur.ops.gather import Engine, Inputs, Lookup, Planes, gather_lists, read
+from torchblur.ops.pixels import PixelList
 from torchblur.params import Param
 
 __all__ = ["LineBlur", "LineConfig", "line"]
@@ -91,6 +92,7 @@ class LineBlur(BlurFilter):
 
     name = "line"
     config_class = LineConfig
+    per_frame = ()
 
     def compute(self, frame: Frame, values: Values) -> dict[str, Tensor]:
         """Return the blurred "color"."""
@@ -98,20 +100,37 @@ class LineBlur(BlurFilter):
 
 
 def _blur(frame: Frame, values: Values, engine: Engine) -> Tensor:
-    center = Shutter(1, values.shutter_position).center
-    x, y = pixel_grid(frame.color)
+    pixels = _moving_pixels(frame)
+    if pixels.count == 0:
+        return frame.color
+    x, y = pixels.grid(frame.color)
+    center = float(Shutter(1, values.shutter_position).center)
+    color = pixels.pack(frame.color)
     inputs = {
         "texture": frame.color,
-        "half": frame.velocity * (values.shutter * 0.5),
+        "half": pixels.pack(frame.velocity) * (pixels.pack(values.shutter) * 0.5),
         "x": x,
         "y": y,
-        "center": torch.full_like(x[0, 0, 0, 0], float(center)),
+        "center": frame.color.new_full((), center),
     }
     if frame.valid is not None:
         valid = frame.valid.to(frame.dtype)
         inputs["texture"] = torch.cat((frame.color * valid, valid), 1)
-    color, weight = gather(_tap, _Options(values.lookup), values.num_samples, inputs, engine)
-    return torch.where(weight > 0, color / torch.where(weight > 0, weight, 1.0), frame.color)
+    total, weight = gather_lists(
+        _tap, _Options(values.lookup), values.num_samples, inputs, pixels, engine
+    )
+    blurred = torch.where(weight > 0, total / torch.where(weight > 0, weight, 1.0), color)
+    return pixels.unpack(blurred, over=frame.color)
+
+
+def _moving_pixels(frame: Frame) -> PixelList:
+    """Return the pixels that move, and those of no validity; all if a gradient may be wanted."""
+    if torch.is_grad_enabled():
+        return PixelList.all(frame.color)
+    wanted = (frame.velocity != 0).any(1, keepdim=True)
+    if frame.valid is not None:
+        wanted = wanted | ~frame.valid
+    return PixelList.where(wanted)
 
 
 def _tap(index: Tensor, count: Tensor, inputs: Inputs, options: _Options) -> tuple[Planes, Tensor]:

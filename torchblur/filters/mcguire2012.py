@@ -10,18 +10,20 @@ from torch import Tensor
 from torchblur.filters.base import BlurFilter, Values
 from torchblur.filters.reconstruction import (
     WEIGHT_PARAMETERS,
+    Filtered,
+    Moving,
     ReconstructionConfig,
     is_one,
+    moving_part,
     resolve,
+    revealed_part,
     sample,
-    spread_of,
-    texture_of,
+    tiles_of,
 )
-from torchblur.filters.revealed import RevealedBackgroundConfig, revealed_inputs
+from torchblur.filters.revealed import RevealedBackgroundConfig
 from torchblur.frame import Frame, Shutter
-from torchblur.ops.gather import Engine, Inputs, Lookup, Planes, gather, pixel_grid, weighted
+from torchblur.ops.gather import Engine, Inputs, Lookup, Planes, gather_lists, weighted
 from torchblur.ops.noise import noise_plane
-from torchblur.ops.tiles import tile_lookup
 from torchblur.ops.velocity import direction, length
 from torchblur.ops.weights import cone, cylinder, depth_weights
 from torchblur.params import Param
@@ -100,38 +102,32 @@ class McGuire2012Blur(BlurFilter):
     """The tile-based filter of McGuire 2012: TileMax, NeighborMax, one gather. See `mcguire2012`.
 
     `layers` adds "tile_max" and "neighbor_max" (half spread in px, (B, 2, Ty, Tx)) and "weight"
-    (the sum of all weights, (B, 1, H, W)).
+    (the sum of all weights, (B, 1, H, W); 0 where nothing moves).
     """
 
     name = "mcguire2012"
     config_class = McGuire2012Config
+    per_frame = ("shutter",)
 
     def compute(self, frame: Frame, values: Values) -> dict[str, Tensor]:
         """Return "color", "tile_max", "neighbor_max" and "weight"."""
-        return _layers(frame, values, self.engine)
+        return _filtered(frame, values, self.engine).layers(frame)
+
+    def color(self, frame: Frame, values: Values) -> Tensor:
+        """Return the blurred color alone, (B, 3, H, W)."""
+        return _filtered(frame, values, self.engine).color(frame)
 
 
-def _layers(frame: Frame, values: Values, engine: Engine) -> dict[str, Tensor]:
-    spread, tiles = spread_of(frame, values)
-    dominant = tile_lookup(tiles.neighborhood, frame.color, values.tile_size)
-    reach = length(dominant)
-    noise = noise_plane(values.noise, frame.color, seed=values.seed)
-    x, y = pixel_grid(frame.color)
-    inputs = {
-        "texture": texture_of(frame, spread),
-        "x": x,
-        "y": y,
-        "jitter": (noise - 0.5) * values.jitter,
-        "direction": direction(dominant),
-        "reach": reach,
-        "depth": frame.finite_depth(),
-        "length": spread.length,
-        "unit": spread.unit,
-        "extent": values.soft_depth_extent,
-    }
-    for key in WEIGHT_PARAMETERS:
-        inputs[key] = getattr(values, key)
-    inputs |= revealed_inputs(frame, values, lambda f, v: _layers(f, v, engine)["color"])
+def _filtered(frame: Frame, values: Values, engine: Engine) -> Filtered:
+    own, around = tiles_of(frame, values)
+    tiles = {"tile_max": own, "neighbor_max": around}
+    part = moving_part(frame, values, around)
+    if part is None:
+        return Filtered.still(frame, tiles, "weight")
+    inputs = _tap_inputs(part)
+    inputs |= revealed_part(
+        frame, values, part.pixels, lambda f, v: _filtered(f, v, engine).color(f)
+    )
     options = _Options(
         Shutter(1, values.shutter_position).center,
         values.skip_middle_tap and values.shutter_position == "centered",
@@ -139,15 +135,31 @@ def _layers(frame: Frame, values: Values, engine: Engine) -> dict[str, Tensor]:
         values.softness,
         values.color_lookup,
     )
-    sums = gather(_tap, options, values.num_samples, inputs, engine)
-    center_weight = values.center_gain / torch.maximum(spread.length, values.min_length)
-    color, weight = resolve(frame, sums, center_weight, reach > values.early_out)
-    return {
-        "color": color,
-        "tile_max": tiles.own,
-        "neighbor_max": tiles.neighborhood,
-        "weight": weight,
+    sums = gather_lists(_tap, options, values.num_samples, inputs, part.pixels, engine)
+    local = part.values
+    center_weight = local.center_gain / torch.maximum(part.spread.length, local.min_length)
+    moving = inputs["reach"] > local.early_out
+    color, weight = resolve(part.frame, sums, center_weight, moving)
+    return Filtered(tiles, part.pixels, {"color": color, "weight": weight * moving})
+
+
+def _tap_inputs(part: Moving) -> Inputs:
+    color, values, spread, pixels = part.frame.color, part.values, part.spread, part.pixels
+    noise = noise_plane(values.noise, color, seed=values.seed, pixels=pixels)
+    x, y = part.grid()
+    inputs = {
+        "texture": part.texture,
+        "x": x,
+        "y": y,
+        "jitter": (noise - 0.5) * values.jitter,
+        "direction": direction(part.dominant),
+        "reach": length(part.dominant),
+        "depth": part.frame.finite_depth(),
+        "length": spread.length,
+        "unit": spread.unit,
+        "extent": values.soft_depth_extent,
     }
+    return inputs | {key: getattr(values, key) for key in WEIGHT_PARAMETERS}
 
 
 def _tap(index: Tensor, count: Tensor, inputs: Inputs, options: _Options) -> tuple[Planes, Tensor]:

@@ -8,9 +8,17 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from torchblur.configured import batch_size_of
 from torchblur.filters.base import BlurFilter, Values
 from torchblur.filters.notes2025_config import Notes2025Config
-from torchblur.filters.notes2025_gather import Blurred, Line, compose, gather_line, shared_inputs
+from torchblur.filters.notes2025_gather import (
+    SHARED_PARAMETERS,
+    Blurred,
+    Line,
+    compose,
+    gather_line,
+    shared_inputs,
+)
 from torchblur.filters.notes2025_postfilter import post_filter
 from torchblur.filters.reconstruction import Spread
 from torchblur.filters.revealed import layer_behind, revealed_inputs
@@ -18,10 +26,12 @@ from torchblur.frame import Frame, Shutter
 from torchblur.ops.directions import TileDirections, tile_directions
 from torchblur.ops.gather import Engine
 from torchblur.ops.noise import NoiseKind, noise_plane
+from torchblur.ops.pixels import PixelList
 from torchblur.ops.resample import HalfImage, UpsampleRules, box_halve, depth_halve, upsample_over
 from torchblur.ops.tiles import neighbor_max, neighbor_min, tile_lookup, tile_max, tile_min
 from torchblur.ops.tiles import tile_offset as offset_of_tiles
 from torchblur.ops.velocity import clamp_length, direction, half_velocity, length, quantize_uint8
+from torchblur.params import declared
 
 __all__ = ["Notes2025Blur", "Notes2025Config", "notes2025"]
 
@@ -74,10 +84,16 @@ class Notes2025Blur(BlurFilter):
 
     name = "notes2025"
     config_class = Notes2025Config
+    per_frame = tuple(
+        name
+        for name, spec in declared(Notes2025Config).items()
+        if spec.grad != "discrete" and name not in SHARED_PARAMETERS
+    )
 
     def compute(self, frame: Frame, values: Values) -> dict[str, Tensor]:
         """Return "color", the alphas, "weight", "influence" and the tiles."""
         if values.resolution == "half":
+            frame = frame.expand(batch_size_of(values, frame.batch_size))
             return _half_layers(frame, values, self.engine)
         return _layers(frame, values, self.engine)
 
@@ -90,13 +106,19 @@ def _layers(frame: Frame, values: Values, engine: Engine) -> dict[str, Tensor]:
     lines = _lines(first, second, linear, values)
     shared = shared_inputs(frame, spread, linear, values)
     shared |= revealed_inputs(frame, values, lambda f, v: _whole(f, v, engine))
-    sums = [gather_line(shared, line, values, engine) for line in lines]
+    active = PixelList.where(_over_sets(lines[0].used, frame))
+    sums = [gather_line(shared, line, values, engine, active) for line in lines]
     image = compose(frame, sums, lines[0].used, values)
     if values.resolution == "half" and values.alpha_fade:
         image = _faded(image, values)
     if values.post_filter:
         image = post_filter(frame, image, lines, values, engine)
     return image._asdict() | tiles._asdict()
+
+
+def _over_sets(mask: Tensor, frame: Frame) -> Tensor:
+    """Return where any set of parameters that shares the frame has a pixel, (B, 1, H, W)."""
+    return mask.any(0, keepdim=True) if frame.batch_size == 1 else mask
 
 
 def _with(values: Values, **changed: object) -> Values:

@@ -12,13 +12,35 @@ from torchblur.filters.reconstruction import ColorLookup, Spread, Tap, sample, t
 from torchblur.frame import Frame, Shutter
 from torchblur.ops.gather import Engine, Inputs, Planes, gather, pixel_grid, weighted
 from torchblur.ops.noise import dither_2x2, noise_plane
+from torchblur.ops.pixels import PixelList
 from torchblur.ops.spread import Mirror, SpreadForm, TapPair, depth_shares, mirror, spread_weight
 from torchblur.ops.velocity import direction, length
 from torchblur.ops.weights import power, saturate
 
-__all__ = ["Blurred", "Line", "Sums", "compose", "gather_line", "shared_inputs"]
+__all__ = [
+    "SHARED_PARAMETERS",
+    "Blurred",
+    "Line",
+    "Sums",
+    "compose",
+    "gather_line",
+    "shared_inputs",
+]
 
 _SHORTEST_REACH = 1e-3  # px; what is shorter has no direction either
+SHARED_PARAMETERS = (
+    "depth_range",
+    "relative_depth_range",
+    "depth_level",
+    "spread_offset",
+    "spread_slope",
+    "direction_exponent",
+    "area_slope",
+    "alpha_gain",
+    "center_weight",
+)
+"""Parameters of the taps and of their sums: sets of them share one frame."""
+
 _PARAMETERS = ("depth_level", "spread_offset", "spread_slope", "direction_exponent", "area_slope")
 
 
@@ -102,7 +124,9 @@ def shared_inputs(frame: Frame, spread: Spread, linear: Tensor, values: Values) 
     return inputs | {key: getattr(values, key) for key in _PARAMETERS}
 
 
-def gather_line(shared: Inputs, line: Line, values: Values, engine: Engine) -> Sums:
+def gather_line(
+    shared: Inputs, line: Line, values: Values, engine: Engine, active: PixelList
+) -> Sums:
     """Sample along one line and return the means; zero where the line is not used.
 
     Args:
@@ -110,6 +134,7 @@ def gather_line(shared: Inputs, line: Line, values: Values, engine: Engine) -> S
         line: Where to sample.
         values: The parameters.
         engine: Of the gather.
+        active: The pixels where anything moves.
     """
     reach = length(line.vector).clamp_min(_SHORTEST_REACH)
     unit = direction(line.vector)
@@ -130,7 +155,9 @@ def gather_line(shared: Inputs, line: Line, values: Values, engine: Engine) -> S
         values.softness,
         values.color_lookup,
     )
-    *totals, influence = gather(_pair, options, line.most_pairs, inputs, engine, num_maxima=1)
+    *totals, influence = gather(
+        _pair, options, line.most_pairs, inputs, engine, num_maxima=1, active=active
+    )
     *sums, alpha = (total / (2 * line.pairs) for total in totals)
     if values.accurate_alpha:
         alpha = alpha * (1 + values.area_slope * reach)
@@ -199,7 +226,7 @@ def _tap(t: Tensor, inputs: Inputs, options: _Options) -> tuple[Tap, Tensor]:
     alpha = foreground
     if options.accurate_alpha:
         alpha = saturate(foreground / (1 + inputs["area_slope"] * tap.length), options.softness)
-    return tap, torch.cat((background, foreground, alpha), 1)
+    return tap, torch.cat(torch.broadcast_tensors(background, foreground, alpha), 1)
 
 
 def _spread(distance: Tensor, size: Tensor, inputs: Inputs, options: _Options) -> Tensor:

@@ -11,6 +11,7 @@ from torchblur.filters.base import Values
 from torchblur.filters.notes2025_gather import Blurred, Line
 from torchblur.frame import Frame
 from torchblur.ops.gather import Engine, Inputs, Planes, gather, pixel_grid, read, weighted
+from torchblur.ops.pixels import PixelList
 from torchblur.ops.velocity import direction, length
 from torchblur.ops.weights import saturate
 
@@ -75,7 +76,7 @@ def _inputs(frame: Frame, image: Blurred, values: Values) -> Inputs:
         usable = (frame.valid | (image.weight > 0)).to(frame.dtype)
     step = 1 / ((values.num_samples + 1) // 2)
     return {
-        "texture": torch.cat((image.color, alpha, image.output_alpha, usable), 1),
+        "texture": torch.cat(_alike(image.color, alpha, image.output_alpha, usable), 1),
         "x": x,
         "y": y,
         "alpha": alpha,
@@ -83,6 +84,12 @@ def _inputs(frame: Frame, image: Blurred, values: Values) -> Inputs:
         "tau": values.post_tau * step,
         "zero": values.post_zero_alpha,
     }
+
+
+def _alike(*planes: Tensor) -> Planes:
+    """Return the planes with one batch: what no set of parameters changes is there once."""
+    batch_size = max(plane.shape[0] for plane in planes)
+    return tuple(plane.expand(batch_size, -1, -1, -1) for plane in planes)
 
 
 def _along(
@@ -97,7 +104,8 @@ def _along(
         "per_side": gap.detach().ceil().clamp(1, most),
         "used": line.used.to(gap.dtype),
     }
-    return gather(_post_tap, options, 2 * most, inputs, engine, num_maxima=1)
+    active = PixelList.where(line.used.expand(inputs["texture"].shape[0], -1, -1, -1))
+    return gather(_post_tap, options, 2 * most, inputs, engine, num_maxima=1, active=active)
 
 
 def _mean(colors: Tensor, weight: Tensor, center: Tensor, own: Tensor) -> Tensor:

@@ -23,6 +23,7 @@ from torchblur.filters.reconstruction import (
 from torchblur.frame import Frame, Shutter
 from torchblur.ops.gather import Engine, Inputs, Lookup, Planes, gather, pixel_grid, weighted
 from torchblur.ops.noise import NoiseKind, noise_plane
+from torchblur.ops.pixels import PixelList
 from torchblur.ops.tiles import neighbor_max, tile_lookup, tile_max
 from torchblur.ops.velocity import (
     clamp_length,
@@ -212,9 +213,11 @@ def _pass(
     for key in WEIGHT_PARAMETERS:
         inputs[key] = getattr(values, key)
     options = _Options(center, is_one(values.cone_exponent), values.softness, values.color_lookup)
-    sums = gather(_tap, options, values.num_samples, inputs, engine)
+    moving = reach > values.early_out
+    active = PixelList.where(moving)
+    sums = gather(_tap, options, values.num_samples, inputs, engine, active=active)
     center_weight = values.center_gain / inputs["length_p"]
-    return resolve(frame, sums, center_weight, reach > values.early_out)
+    return resolve(frame, sums, center_weight, moving)
 
 
 def _tap(index: Tensor, count: Tensor, inputs: Inputs, options: _Options) -> tuple[Planes, Tensor]:

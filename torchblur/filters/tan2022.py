@@ -25,6 +25,7 @@ from torchblur.filters.tan2022_config import Tan2022Config
 from torchblur.frame import Frame, Shutter
 from torchblur.ops.gather import Engine, Inputs, Lookup, Planes, gather, pixel_grid, weighted
 from torchblur.ops.noise import noise_plane
+from torchblur.ops.pixels import PixelList
 from torchblur.ops.raymask import RayMask, edge_strength, ray_mask, uncovered
 from torchblur.ops.tiles import tile_lookup
 from torchblur.ops.velocity import direction, length
@@ -215,9 +216,12 @@ def _gather(
         values.threshold_softness,
         values.color_lookup,
     )
-    front_color, front, back_color, back = gather(_tap, options, values.num_samples, inputs, engine)
-    center = values.center_gain / inputs["length"]
     moving = length(dominant) > values.early_out
+    active = PixelList.where(moving)
+    front_color, front, back_color, back = gather(
+        _tap, options, values.num_samples, inputs, engine, active=active
+    )
+    center = values.center_gain / inputs["length"]
     return _Sums(front_color, front, back_color, back, center, moving)
 
 

@@ -26,6 +26,7 @@ __all__ = [
     "Planes",
     "TapFunction",
     "gather",
+    "gather_lists",
     "lookup",
     "pixel_grid",
     "read",
@@ -45,7 +46,7 @@ def gather(
     engine: Engine = "eager",
     *,
     num_maxima: int = 0,
-    active: Tensor | None = None,
+    active: PixelList | None = None,
 ) -> tuple[Tensor, ...]:
     """Return the sums over ``num_samples`` taps of what the tap function returns.
 
@@ -63,7 +64,7 @@ def gather(
         engine: "eager", or "compiled" to compile the tap function with `torch.compile`; without
             a compiler there is one warning and the eager result.
         num_maxima: So many accumulators, the last ones, are maxima over the taps, not sums.
-        active: Pixels that are wanted, bool, (B or P, 1, H, W); the others are 0 and cost nothing.
+        active: The pixels that are wanted, all if left out; the others are 0 and cost nothing.
 
     Returns:
         The accumulators (B or P, C, H, W), in the tap's order.
@@ -75,10 +76,40 @@ def gather(
     Raises:
         ConfigError: if the engine has another name.
     """
-    pixels = PixelList.where(inputs["texture"], active)
+    pixels = PixelList.all(inputs["texture"]) if active is None else active
     lists = pixels.lists(inputs)
-    totals = sum_taps(tap, options, num_samples, lists, engine, num_maxima=num_maxima)
-    return tuple(pixels.unpack(total) for total in totals)
+    sums = gather_lists(tap, options, num_samples, lists, pixels, engine, num_maxima=num_maxima)
+    return tuple(pixels.unpack(total) for total in sums)
+
+
+def gather_lists(
+    tap: TapFunction,
+    options: Hashable,
+    num_samples: int,
+    lists: Mapping[str, Tensor],
+    pixels: PixelList,
+    engine: Engine = "eager",
+    *,
+    num_maxima: int = 0,
+) -> tuple[Tensor, ...]:
+    """Return the same as `gather` from lists of pixels, as lists (P, C, 1, M).
+
+    Args:
+        tap: As in `gather`.
+        options: Likewise.
+        num_samples: Likewise.
+        lists: The inputs; all but the textures are lists of the pixels, or parameters as
+            `PixelList.pack` returns them.
+        pixels: The pixels.
+        engine: As in `gather`.
+        num_maxima: Likewise.
+
+    Differentiable: as `gather`.
+    """
+    inputs = pixels.with_textures(lists)
+    return sum_taps(
+        tap, options, num_samples, inputs, engine, num_maxima=num_maxima, num_pixels=pixels.count
+    )
 
 
 def read(
@@ -161,12 +192,15 @@ def _split(planes: Planes) -> Planes:
 # -- lookups ---------------------------------------------------------------------------------------
 
 
-def pixel_grid(like: Tensor) -> tuple[Tensor, Tensor]:
+def pixel_grid(like: Tensor, pixels: PixelList | None = None) -> tuple[Tensor, Tensor]:
     """Return column and row indices of all pixels, shapes (1, 1, 1, W) and (1, 1, H, 1).
 
     Args:
         like: A tensor (B, C, H, W) whose size, device and type they take.
+        pixels: Only those; `like` then tells device and type alone, and both are (1, 1, 1, M).
     """
+    if pixels is not None:
+        return pixels.grid(like)
     height, width = like.shape[-2:]
     x = torch.arange(width, device=like.device, dtype=like.dtype)
     y = torch.arange(height, device=like.device, dtype=like.dtype)
@@ -177,7 +211,7 @@ def lookup(texture: Tensor, x: Tensor, y: Tensor, mode: Lookup = "nearest") -> T
     """Return a texture's values at positions in pixel indices.
 
     Args:
-        texture: Planes, (B, C, H, W).
+        texture: Planes, (B, C, H, W); one texture serves any batch of positions.
         x: Columns, px; 0 is the center of the first pixel. Broadcasts to (B, 1, H', W').
         y: Rows, px, likewise.
         mode: "nearest" (ties to even) or "bilinear".
@@ -190,6 +224,7 @@ def lookup(texture: Tensor, x: Tensor, y: Tensor, mode: Lookup = "nearest") -> T
     """
     height, width = texture.shape[-2:]
     x, y = torch.broadcast_tensors(x, y)
+    texture = texture.expand(max(texture.shape[0], x.shape[0]), -1, -1, -1)
     if mode == "bilinear":
         grid = torch.stack(((2 * x + 1) / width - 1, (2 * y + 1) / height - 1), dim=-1)[:, 0]
         grid = grid.expand(texture.shape[0], -1, -1, -1)

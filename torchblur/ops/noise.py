@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from torchblur.ops.gather import pixel_grid
+from torchblur.ops.pixels import PixelList
 
 __all__ = [
     "NoiseKind",
@@ -46,13 +47,16 @@ def halton(count: int, base: int) -> Tensor:
     return result
 
 
-def halton_plane(like: Tensor, stream: int = 0, seed: int = 0) -> Tensor:
+def halton_plane(
+    like: Tensor, stream: int = 0, seed: int = 0, pixels: PixelList | None = None
+) -> Tensor:
     """Return a plane of Halton points: a shuffled tile of 32² points, repeated.
 
     Args:
         like: Any tensor of the image's size, (B, C, H, W).
         stream: 0 to 3; streams use other bases, so that they do not correlate.
         seed: Shuffles the tile; give each frame of a sequence its own.
+        pixels: For these alone, as a list (1, 1, 1, M).
 
     Returns:
         Values in [0, 1), (1, 1, H, W).
@@ -63,45 +67,51 @@ def halton_plane(like: Tensor, stream: int = 0, seed: int = 0) -> Tensor:
     generator = torch.Generator().manual_seed(seed * len(_BASES) + stream)
     order = torch.randperm(_TILE * _TILE, generator=generator)
     tile = halton(_TILE * _TILE, _BASES[stream])[order].reshape(_TILE, _TILE)
-    height, width = like.shape[-2:]
+    tile = tile.to(device=like.device, dtype=like.dtype)
+    height, width = like.shape[-2:] if pixels is None else pixels.size
     repeated = tile.repeat(-(-height // _TILE), -(-width // _TILE))[:height, :width]
-    return repeated.to(device=like.device, dtype=like.dtype)[None, None]
+    plane = repeated[None, None]
+    return plane if pixels is None else pixels.pack(plane)
 
 
-def interleaved_gradient_noise(like: Tensor, stream: int = 0, seed: int = 0) -> Tensor:
+def interleaved_gradient_noise(
+    like: Tensor, stream: int = 0, seed: int = 0, pixels: PixelList | None = None
+) -> Tensor:
     """Return ``frac(52.9829189 · frac(0.06711056 x + 0.00583715 y))``.
 
     Args:
         like: Any tensor of the image's size, (B, C, H, W).
         stream: Shifts the pattern, so that two streams differ.
         seed: Shifts the pattern; give each frame of a sequence its own.
+        pixels: For these alone, as a list (1, 1, 1, M).
 
     Returns:
         Values in [0, 1), (1, 1, H, W).
 
     Reference: Jimenez 2014.
     """
-    x, y = pixel_grid(like)
+    x, y = pixel_grid(like, pixels)
     shift = _FRAME_STRIDE * (seed % 64)
     shift_x, shift_y = shift + 13.0 * stream, shift + 29.0 * stream  # no correlation: measured
     inner = 0.06711056 * (x + shift_x) + 0.00583715 * (y + shift_y)
     return torch.remainder(52.9829189 * torch.remainder(inner, 1.0), 1.0)
 
 
-def checkerboard(like: Tensor) -> Tensor:
+def checkerboard(like: Tensor, pixels: PixelList | None = None) -> Tensor:
     """Return ``(x + y) & 1``: 0 and 1 by turns.
 
     Args:
         like: Any tensor of the image's size, (B, C, H, W).
+        pixels: For these alone, as a list (1, 1, 1, M).
 
     Returns:
         Zeros and ones, (1, 1, H, W).
     """
-    x, y = pixel_grid(like)
+    x, y = pixel_grid(like, pixels)
     return torch.remainder(x + y, 2)
 
 
-def dither_2x2(like: Tensor) -> Tensor:
+def dither_2x2(like: Tensor, pixels: PixelList | None = None) -> Tensor:
     """Return the ordered dither of 2x2 pixels, ``[[+¼, −¼], [−¼, +¼]]``.
 
     Two neighbors shift their taps by half a step against each other, so that the mean of a
@@ -109,16 +119,19 @@ def dither_2x2(like: Tensor) -> Tensor:
 
     Args:
         like: Any tensor of the image's size, (B, C, H, W).
+        pixels: For these alone, as a list (1, 1, 1, M).
 
     Returns:
         Plus and minus one quarter, (1, 1, H, W).
 
     Reference: Jimenez 2014, as in public ports.
     """
-    return 0.25 - 0.5 * checkerboard(like)
+    return 0.25 - 0.5 * checkerboard(like, pixels)
 
 
-def noise_plane(kind: NoiseKind, like: Tensor, stream: int = 0, seed: int = 0) -> Tensor:
+def noise_plane(
+    kind: NoiseKind, like: Tensor, stream: int = 0, seed: int = 0, pixels: PixelList | None = None
+) -> Tensor:
     """Return a plane of noise by its name; "none" is one half everywhere.
 
     Args:
@@ -126,12 +139,14 @@ def noise_plane(kind: NoiseKind, like: Tensor, stream: int = 0, seed: int = 0) -
         like: Any tensor of the image's size, (B, C, H, W).
         stream: Streams of one seed do not correlate.
         seed: Another pattern for another seed.
+        pixels: For these alone, as a list (1, 1, 1, M).
 
     Returns:
         Values in [0, 1), (1, 1, H, W).
     """
     if kind == "halton":
-        return halton_plane(like, stream, seed)
+        return halton_plane(like, stream, seed, pixels)
     if kind == "gradient":
-        return interleaved_gradient_noise(like, stream, seed)
-    return torch.full_like(like[:1, :1], 0.5)
+        return interleaved_gradient_noise(like, stream, seed, pixels)
+    shape = (1, 1, *like.shape[-2:]) if pixels is None else (1, 1, 1, pixels.count)
+    return like.new_full(shape, 0.5)

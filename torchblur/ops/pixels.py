@@ -1,8 +1,9 @@
 """Lists of pixels: the planes of a batch of images as (P, C, 1, M), and back.
 
 M pixels of all images of the batch, or only those that are wanted; P is 1, or the number of
-parameter sets that share one image. Work on lists costs what their pixels cost, and one compiled
-kernel serves any size, batch and share of wanted pixels.
+parameter sets that share one image. To elementwise code a list is an image of one row. Work on
+lists costs what their pixels cost, and one compiled kernel serves any size, batch and share of
+wanted pixels.
 """
 
 from __future__ import annotations
@@ -13,9 +14,21 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-__all__ = ["PixelList"]
+__all__ = ["PixelList", "select"]
 
 _DENSE = 0.8  # share of wanted pixels from which all are done: packing costs, too
+
+
+def select(packed: Tensor, chosen: Tensor) -> Tensor:
+    """Return some pixels of a list, (P, C, 1, m).
+
+    Args:
+        packed: The list, (P, C, 1, M).
+        chosen: Positions, int64, (m,).
+    """
+    # Two dimensions take a fast path that four do not.
+    flat = packed.reshape(-1, packed.shape[3]).index_select(1, chosen)
+    return flat.view(*packed.shape[:3], -1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,28 +46,86 @@ class PixelList:
     index: Tensor | None = None
 
     @classmethod
-    def where(cls, like: Tensor, wanted: Tensor | None = None) -> PixelList:
-        """Return the list of the wanted pixels; all of them if that is nearly all.
+    def all(cls, like: Tensor) -> PixelList:
+        """Return the list of all pixels.
 
         Args:
             like: Any tensor of the images' size, (B, C, H, W).
-            wanted: bool, (B, 1, H, W); with B = 1 also (P, 1, H, W): any set's wish counts.
+        """
+        return cls(like.shape[0], (like.shape[2], like.shape[3]))
+
+    @classmethod
+    def in_tiles(cls, wanted: Tensor, like: Tensor, tile_size: int) -> PixelList:
+        """Return the list of the pixels in some tiles; all of them if that is nearly all.
+
+        Args:
+            wanted: Tiles, bool, (B, 1, Ty, Tx); with B = 1 also (P, 1, Ty, Tx): any set counts.
+            like: Any tensor of the images' size, (B, C, H, W).
+            tile_size: Edge of a tile, px.
         """
         height, width = like.shape[-2:]
-        index = None
-        if wanted is not None:
-            if like.shape[0] == 1:
-                wanted = wanted.any(0, keepdim=True)
-            found = wanted.expand(like.shape[0], -1, height, width).flatten().nonzero()[:, 0]
-            if found.shape[0] < _DENSE * like.shape[0] * height * width:
-                index = found
-        return cls(like.shape[0], (height, width), index)
+        if like.shape[0] == 1:
+            wanted = wanted.any(0, keepdim=True)
+        rows = wanted.repeat_interleave(tile_size, 2)[:, :, :height]
+        return cls.where(rows.repeat_interleave(tile_size, 3)[..., :width])
+
+    @classmethod
+    def where(cls, wanted: Tensor) -> PixelList:
+        """Return the list of the wanted pixels; all of them if that is nearly all.
+
+        Args:
+            wanted: bool, (B, 1, H, W).
+        """
+        whole = cls.all(wanted)
+        index = wanted.flatten().nonzero()[:, 0]
+        return whole if index.shape[0] > _DENSE * whole.count else cls(*whole.shape, index)
+
+    def some(self, chosen: Tensor) -> PixelList:
+        """Return the list of some of these pixels.
+
+        Args:
+            chosen: Positions in this list, int64, (m,).
+        """
+        index = chosen if self.index is None else self.index[chosen]
+        return PixelList(*self.shape, index)
+
+    @property
+    def shape(self) -> tuple[int, tuple[int, int]]:
+        """Number and size of the images."""
+        return self.batch_size, self.size
 
     @property
     def count(self) -> int:
         """Number of pixels, M."""
         height, width = self.size
         return self.batch_size * height * width if self.index is None else self.index.shape[0]
+
+    def grid(self, like: Tensor) -> tuple[Tensor, Tensor]:
+        """Return column and row of each pixel in its own image, (1, 1, 1, M) each.
+
+        Args:
+            like: A tensor of the wanted type and device.
+        """
+        height, width = self.size
+        x = torch.arange(width, device=like.device, dtype=like.dtype).view(1, 1, 1, width)
+        y = torch.arange(height, device=like.device, dtype=like.dtype).view(1, 1, height, 1)
+        image = (self.batch_size, 1, height, width)
+        return self._listed(x.expand(image)), self._listed(y.expand(image))
+
+    def image(self, like: Tensor) -> Tensor:
+        """Return which image of the batch each pixel is of, (1, 1, 1, M).
+
+        Args:
+            like: A tensor of the wanted type and device.
+        """
+        height, width = self.size
+        number = torch.div(self._places(like), height * width, rounding_mode="floor")
+        return number.to(like.dtype).view(1, 1, 1, -1)
+
+    def _places(self, like: Tensor) -> Tensor:
+        if self.index is not None:
+            return self.index
+        return torch.arange(self.count, device=like.device)
 
     def pack(self, plane: Tensor) -> Tensor:
         """Return a plane's pixels, (P, C, 1, M); what has no pixels of its own stays as it is.
@@ -64,37 +135,48 @@ class PixelList:
 
         Differentiable: yes.
         """
-        if plane.ndim == 0 or plane.numel() == 1:
+        if plane.ndim == 0 or (plane.numel() == 1 and self.size != (1, 1)):
             return plane.reshape(())
-        height, width = self.size
-        if self.batch_size > 1:
-            if plane.shape[0] == 1 and plane.shape[-2:] == (1, 1):
-                return plane
-            plane = plane.expand(self.batch_size, -1, height, width).transpose(0, 1)
-            packed = plane.reshape(1, plane.shape[0], 1, -1)
-        elif plane.shape[-2:] == (1, 1):
+        if plane.shape[-2:] == (1, 1) and (self.batch_size == 1 or plane.shape[0] == 1):
             return plane
-        else:
-            packed = plane.expand(-1, -1, height, width).reshape(*plane.shape[:2], 1, -1)
-        return packed if self.index is None else packed[..., self.index]
+        return self._listed(plane.expand(-1, -1, *self.size))
 
-    def unpack(self, packed: Tensor) -> Tensor:
-        """Return the images of a list, (B, C, H, W) or (P, C, H, W); 0 at all other pixels.
+    def _listed(self, images: Tensor) -> Tensor:
+        if self.batch_size > 1:
+            images = images.expand(self.batch_size, -1, -1, -1).transpose(0, 1)
+            packed = images.reshape(1, images.shape[0], 1, -1)
+        else:
+            packed = images.reshape(*images.shape[:2], 1, -1)
+        return packed if self.index is None else select(packed, self.index)
+
+    def unpack(self, packed: Tensor, over: Tensor | float = 0.0) -> Tensor:
+        """Return the images of a list, (B, C, H, W) or (P, C, H, W).
 
         Args:
-            packed: (P, C, 1, M).
+            packed: Broadcasts to (P, C, 1, M).
+            over: What all other pixels have: a number, or images that broadcast to the result.
 
         Differentiable: yes.
         """
         height, width = self.size
+        packed = packed.expand(-1, -1, 1, self.count)
         sets, channels = packed.shape[:2]
+        if self.count == 0 and isinstance(over, Tensor) and over.shape[0] >= sets:
+            return over
         if self.index is not None:
-            pixels = self.batch_size * height * width
-            whole = packed.new_zeros(sets, channels, 1, pixels)
-            packed = whole.index_copy(3, self.index, packed.expand(-1, -1, 1, self.count))
+            places = self.index.view(1, 1, 1, -1).expand(packed.shape)
+            packed = self._whole(packed, over).scatter(3, places, packed)
         if self.batch_size > 1:
             return packed.reshape(channels, self.batch_size, height, width).transpose(0, 1)
         return packed.reshape(sets, channels, height, width)
+
+    def _whole(self, packed: Tensor, over: Tensor | float) -> Tensor:
+        """Return `over` as a list of all pixels, (P, C, 1, B * H * W)."""
+        whole = PixelList(*self.shape)
+        shape = (*packed.shape[:3], whole.count)
+        if not isinstance(over, Tensor):
+            return packed.new_full(shape, over)
+        return whole.pack(over).expand(shape)
 
     def texture(self, texture: Tensor) -> Tensor:
         """Return the images of a batch (B, C, H, W) below each other, (C, B * H, W)."""
@@ -109,18 +191,22 @@ class PixelList:
         Returns:
             "first_row" of each pixel's image, (1, 1, 1, M), and the "height" of all, 0-d.
         """
-        height, width = self.size
-        rows = torch.arange(self.batch_size, device=like.device).to(like.dtype) * height
-        first_row = rows.repeat_interleave(height * width).view(1, 1, 1, -1)
-        return {
-            "first_row": first_row if self.index is None else first_row[..., self.index],
-            "height": torch.tensor(float(height), dtype=like.dtype, device=like.device),
-        }
+        height = torch.full((), float(self.size[0]), dtype=like.dtype, device=like.device)
+        if self.batch_size > 1:
+            return {"first_row": self.image(like) * height, "height": height}
+        return {"first_row": like.new_zeros(1, 1, 1, self.count), "height": height}
 
     def lists(self, inputs: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        """Return all inputs of a gather: textures as `texture` has them, all else as lists."""
-        lists = {
-            name: self.texture(plane) if name.startswith("texture") else self.pack(plane)
+        """Return the inputs of a gather, textures as they are and all else as lists."""
+        return {
+            name: plane if name.startswith("texture") else self.pack(plane)
             for name, plane in inputs.items()
         }
-        return lists | self.rows(inputs["texture"])
+
+    def with_textures(self, lists: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        """Return lists with their textures as `texture` has them, and the `rows`."""
+        stacked = {
+            name: self.texture(plane) if name.startswith("texture") else plane
+            for name, plane in lists.items()
+        }
+        return stacked | self.rows(lists["texture"])

@@ -2,12 +2,15 @@
 
 As the accumulators are sums, the incoming gradient is the same for every tap: the backward pass
 runs over the taps again and stores nothing per tap. The same tap function runs eagerly or
-compiled; its index and their number are tensors, so that neither compiles anew.
+compiled; its index and their number are tensors, so that neither compiles anew. On a CPU a part of
+the pixels goes through all taps before the next: what it needs stays in the cache, and what lies
+between forward and backward of a tap is never larger than a part.
 """
 
 from __future__ import annotations
 
 import functools
+import itertools
 import math
 from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass
@@ -34,6 +37,8 @@ Added = tuple[Tensor | Planes, ...]
 TapFunction = Callable[[Tensor, Tensor, Inputs, Any], Added]
 """``tap(index, count, inputs, options)``: index and count are 0-d float tensors."""
 
+_PART = 1 << 16  # pixels; the planes of so many fill a CPU's cache of the second level
+
 
 def sum_taps(
     tap: TapFunction,
@@ -43,6 +48,7 @@ def sum_taps(
     engine: Engine = "eager",
     *,
     num_maxima: int = 0,
+    num_pixels: int | None = None,
 ) -> Planes:
     """Return the sums over ``num_samples`` taps of what the tap function returns.
 
@@ -55,6 +61,8 @@ def sum_taps(
         engine: "eager", or "compiled" to compile the tap function with `torch.compile`; without
             a compiler there is one warning and the eager result.
         num_maxima: So many accumulators, the last ones, are maxima over the taps, not sums.
+        num_pixels: Inputs (P, C, 1, `num_pixels`) are lists of pixels, which the tap takes each on
+            its own, so that they can be worked on in parts. None: there are no lists.
 
     Returns:
         The accumulators; where the tap returns a tuple of planes, they are joined along
@@ -78,7 +86,7 @@ def sum_taps(
     for candidate in ("compiled", "eager") if engine == "compiled" else ("eager",):
         kernel = _kernel(tap, options, candidate, form.num_summed)
         try:
-            return form.joined(_run(kernel, num_samples, form, given))
+            return form.joined(_run(_Sum(kernel, num_samples, form, num_pixels), given))
         except compiler_errors() as error:
             if candidate == "eager":
                 raise
@@ -154,62 +162,115 @@ class _Kernel:
     pull: Callable[..., tuple[Inputs, Planes]]
 
 
-def _run(kernel: _Kernel, num_samples: int, form: _Form, inputs: Inputs) -> Planes:
+@dataclass(frozen=True, eq=False)
+class _Sum:
+    """One sum over taps: what is added, how often, and over how many pixels."""
+
+    kernel: _Kernel
+    num_samples: int
+    form: _Form
+    num_pixels: int | None
+
+    def is_list(self, tensor: Tensor) -> bool:
+        """Whether a tensor is a list of pixels, of which a part can be taken."""
+        return tensor.ndim == 4 and tensor.shape[-1] == self.num_pixels
+
+    def parts(self, like: Tensor) -> list[slice | None]:
+        """Return parts of about equal size; [None] for all pixels at once."""
+        if self.num_pixels is None or self.num_pixels <= _PART or like.device.type != "cpu":
+            return [None]
+        count = -(-self.num_pixels // _PART)
+        ends = [self.num_pixels * i // count for i in range(count + 1)]
+        return [slice(start, stop) for start, stop in itertools.pairwise(ends)]
+
+    def part(self, tensor: Tensor, part: slice | None) -> Tensor:
+        """Return a part of a list, and anything else as it is."""
+        # A copy: views with offsets would each be compiled anew.
+        return tensor if part is None or not self.is_list(tensor) else tensor[..., part].clone()
+
+    def put(self, whole: Tensor, piece: Tensor, part: slice | None) -> Tensor:
+        """Write a part of a list into the whole of it; anything else takes its place."""
+        if part is None or not self.is_list(whole):
+            return piece
+        whole[..., part] = piece
+        return whole
+
+
+def _run(job: _Sum, inputs: Inputs) -> Planes:
     if torch.is_grad_enabled() and any(t.requires_grad for t in inputs.values()):
-        return _apply(kernel, num_samples, form, tuple(inputs), *inputs.values())
-    return _sum(kernel, num_samples, form, inputs)
+        return _apply(job, tuple(inputs), *inputs.values())
+    return _sum(job, inputs)
 
 
 class _SumTaps(torch.autograd.Function):
     """Sum over taps whose backward recomputes each tap."""
 
     @staticmethod
-    def forward(
-        ctx: Any,
-        kernel: _Kernel,
-        num_samples: int,
-        form: _Form,
-        names: tuple[str, ...],
-        *tensors: Tensor,
-    ) -> Planes:
-        ctx.kernel, ctx.num_samples, ctx.names = kernel, num_samples, names
-        sums = _sum(kernel, num_samples, form, dict(zip(names, tensors, strict=True)))
-        ctx.save_for_backward(*tensors, *sums[form.num_summed :])
+    def forward(ctx: Any, job: _Sum, names: tuple[str, ...], *tensors: Tensor) -> Planes:
+        ctx.job, ctx.names = job, names
+        sums = _sum(job, dict(zip(names, tensors, strict=True)))
+        ctx.save_for_backward(*tensors, *sums[job.form.num_summed :])
         return sums
 
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
-        needed = ctx.needs_input_grad[4:]
+        job, needed = ctx.job, ctx.needs_input_grad[2:]
         tensors = [tensor.detach() for tensor in ctx.saved_tensors]
-        saved, peaks = tensors[: len(needed)], tuple(tensors[len(needed) :])
-        named = dict(zip(ctx.names, saved, strict=True))
-        wanted = {n: named[n] for n, w in zip(ctx.names, needed, strict=True) if w}
-        others = {n: t for n, t in named.items() if n not in wanted}
-        totals = {name: torch.zeros_like(t) for name, t in wanted.items()}
-        taken = tuple(torch.zeros_like(peak, dtype=torch.bool) for peak in peaks)
-        # Views of other tensors would be another case to the compiler for each shape of those.
-        grads = tuple(grad.clone(memory_format=torch.contiguous_format) for grad in grads)
-        indices, number = _indices(ctx.num_samples, _floating(named))
-        for index in indices:
-            totals, taken = ctx.kernel.pull(
-                totals, taken, index, number, wanted, others, grads, peaks
-            )
-        return (None,) * 4 + tuple(totals.get(name) for name in ctx.names)
+        named = dict(zip(ctx.names, tensors[: len(needed)], strict=True))
+        wanted = [name for name, needs in zip(ctx.names, needed, strict=True) if needs]
+        totals = {name: torch.zeros_like(named[name]) for name in wanted}
+        # Any pixel of a texture may be read by any part: its gradient is summed over all at once.
+        whole = any(named[name].ndim == 3 for name in wanted)
+        for part in [None] if whole else job.parts(_floating(named)):
+            cut = [job.part(tensor, part) for tensor in (*tensors, *grads)]
+            pulled = _pull(job, dict(zip(ctx.names, cut, strict=False)), wanted, cut[len(needed) :])
+            for name, piece in pulled.items():
+                if part is not None and not job.is_list(totals[name]):
+                    piece = totals[name] + piece
+                totals[name] = job.put(totals[name], piece, part)
+        return (None, None, *(totals.get(name) for name in ctx.names))
 
 
 _apply: Callable[..., Planes] = _SumTaps.apply
 
 
+def _pull(job: _Sum, named: Inputs, wanted: Sequence[str], rest: Sequence[Tensor]) -> Inputs:
+    """Return the gradients of the wanted inputs, of one part of the pixels.
+
+    Args:
+        job: The sum.
+        named: All inputs.
+        wanted: Names of those whose gradient is wanted.
+        rest: The maxima, then the gradients of all accumulators.
+    """
+    num_maxima = len(job.form.shapes) - job.form.num_summed
+    peaks = tuple(rest[:num_maxima])
+    # Views of other tensors would be another case to the compiler for each shape of those.
+    grads = tuple(g.clone(memory_format=torch.contiguous_format) for g in rest[num_maxima:])
+    leaves = {name: named[name] for name in wanted}
+    others = {name: tensor for name, tensor in named.items() if name not in leaves}
+    totals = {name: torch.zeros_like(tensor) for name, tensor in leaves.items()}
+    taken = tuple(torch.zeros_like(peak, dtype=torch.bool) for peak in peaks)
+    indices, number = _indices(job.num_samples, _floating(named))
+    for index in indices:
+        totals, taken = job.kernel.pull(totals, taken, index, number, leaves, others, grads, peaks)
+    return totals
+
+
 @torch.no_grad()
-def _sum(kernel: _Kernel, num_samples: int, form: _Form, inputs: Inputs) -> Planes:
+def _sum(job: _Sum, inputs: Inputs) -> Planes:
     like = _floating(inputs)
     inputs = {name: tensor.detach() for name, tensor in inputs.items()}
-    sums = form.start(like)
-    indices, number = _indices(num_samples, like)
-    for index in indices:
-        sums = kernel.add(sums, index, number, inputs)
-    return sums
+    indices, number = _indices(job.num_samples, like)
+    whole = job.form.start(like)
+    for part in job.parts(like):
+        cut = {name: job.part(tensor, part) for name, tensor in inputs.items()}
+        sums = tuple(job.part(plane, part) for plane in whole)
+        for index in indices:
+            sums = job.kernel.add(sums, index, number, cut)
+        whole = tuple(job.put(*pair, part) for pair in zip(whole, sums, strict=True))
+    return whole
 
 
 def _indices(num_samples: int, like: Tensor) -> tuple[Planes, Tensor]:

@@ -11,6 +11,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from torchblur.ops.gather import lookup, pixel_grid
+from torchblur.ops.pixels import PixelList
 from torchblur.ops.velocity import direction, length
 
 __all__ = [
@@ -155,7 +156,13 @@ def tile_variance(tile_velocity: Tensor, min_length: float | Tensor = 0.5) -> Te
     return moving * (1 - agreement / count.clamp(min=1))
 
 
-def tile_offset(like: Tensor, noise: Tensor, tile_size: int, tau: float | Tensor) -> Tensor:
+def tile_offset(
+    like: Tensor,
+    noise: Tensor,
+    tile_size: int,
+    tau: float | Tensor,
+    pixels: PixelList | None = None,
+) -> Tensor:
     """Return the shift of each pixel's tile lookup: only near edges, never to a diagonal tile.
 
     Along one axis, which alternates like a checkerboard, the shift is ``τ · b · (ξ − ½)`` tiles
@@ -167,6 +174,7 @@ def tile_offset(like: Tensor, noise: Tensor, tile_size: int, tau: float | Tensor
         noise: ξ in [0, 1), broadcasts to (B, 1, H, W).
         tile_size: r in px.
         tau: τ; 0 turns it off.
+        pixels: For these alone; noise and shift are lists of them, (P, C, 1, M).
 
     Returns:
         Shift in tiles, x and y, (B, 2, H, W).
@@ -174,7 +182,7 @@ def tile_offset(like: Tensor, noise: Tensor, tile_size: int, tau: float | Tensor
     Reference: Guertin 2014, section 4.2. We differ: the paper has "a simple linear fall-off";
         this is the one that CryENGINE uses.
     """
-    x, y = pixel_grid(like)
+    x, y = pixel_grid(like, pixels)
     along_x = torch.remainder(x + y, 2) == 0
     shift = tau * (noise - 0.5)
     shift_x = torch.where(along_x, shift * _edge_distance(x, tile_size), 0.0)
@@ -193,6 +201,7 @@ def tile_lookup(
     offset: Tensor | None = None,
     *,
     bilinear: bool = False,
+    pixels: PixelList | None = None,
 ) -> Tensor:
     """Return for each pixel the value of its tile.
 
@@ -202,15 +211,19 @@ def tile_lookup(
         tile_size: r in px.
         offset: Shift in tiles from `tile_offset`, (B, 2, H, W).
         bilinear: Interpolate between the middles of tiles instead of taking the nearest.
+        pixels: For these alone; the shift and the result are lists of them, (P, C, 1, M).
 
     Returns:
         Planes per pixel, (B, C, H, W).
 
     Border: replicated.
     """
-    x, y = ((axis + 0.5) / tile_size for axis in pixel_grid(like))
+    x, y = ((axis + 0.5) / tile_size for axis in pixel_grid(like, pixels))
     if offset is not None:
         x, y = x + offset[:, :1], y + offset[:, 1:]
-    if bilinear:
-        return lookup(tiles, x - 0.5, y - 0.5, "bilinear")
-    return lookup(tiles, x.floor(), y.floor())
+    x, y = (x - 0.5, y - 0.5) if bilinear else (x.floor(), y.floor())
+    if pixels is not None and pixels.batch_size > 1:
+        height = tiles.shape[2]
+        y = y.clamp(0, height - 1) + pixels.image(like) * height
+        tiles = pixels.texture(tiles)[None]
+    return lookup(tiles, x, y, "bilinear" if bilinear else "nearest")

@@ -121,8 +121,10 @@ def power(base: Tensor, exponent: float | Tensor) -> Tensor:
         base: Values >= 0.
         exponent: > 0.
     """
+    # One logarithm for value and gradients, where `**` takes three powers.
     positive = base > _TINY
-    return torch.where(positive, torch.where(positive, base, 1.0) ** exponent, 0.0)
+    logarithm = torch.where(positive, base, 1.0).log()
+    return torch.where(positive, (exponent * logarithm).exp(), 0.0)
 
 
 def threshold(value: Tensor, softness: float = 0.0) -> Tensor:
