@@ -50,6 +50,8 @@ class FilterContract:
     """Per parameter: what else must be set for it to act at all."""
     inert: ClassVar[tuple[str, ...]] = ()
     """Parameters of all filters that change nothing in this one."""
+    one_structure: ClassVar[dict[str, Any]] = {}
+    """Switches with which the frame's content does not decide which kernels there are."""
     box_tolerance: ClassVar[float] = 0.02
     """Largest mean difference to a box blur under uniform motion, color in [0, 1]."""
 
@@ -367,7 +369,8 @@ class FilterContract:
     def test_compiled_once_per_structure(self, monkeypatch: pytest.MonkeyPatch) -> None:
         compiled = traced_kernels(monkeypatch)
         frame, other = (self.given(random_frame(40, 44, seed=seed)) for seed in (1, 2))
-        blur = self.filter_class(None, engine="compiled", **self.few_taps())
+        params = self.few_taps() | self.one_structure
+        blur = self.filter_class(None, engine="compiled", **params)
 
         def run(frame: Frame, **overrides: Any) -> int:
             leaf = frame.color.clone().requires_grad_()
@@ -389,7 +392,7 @@ class FilterContract:
         before = run(Frame.stack([frame, other]))
         assert run(Frame.stack([frame, other, frame])) == before
         assert run(self.given(random_frame(50, 60))) == before
-        blur = self.filter_class(None, engine="compiled", **(self.few_taps() | {"shutter": 0.8}))
+        blur = self.filter_class(None, engine="compiled", **(params | {"shutter": 0.8}))
         assert run(frame) == before
 
     @pytest.mark.parametrize("size", [(1, 1), (1, 9), (7, 1), (13, 41)])
