@@ -133,3 +133,72 @@ def test_a_tied_maximum_gives_its_gradient_to_one_tap():
     _, peak = sum_taps(peak_tap, "nearest", 5, leaves, num_maxima=1)
     peak.sum().backward()
     assert float(leaves["decay"].grad) == 6.0
+
+
+def list_tap(index, count, inputs, options):
+    weight = torch.exp(-inputs["decay"] * (index + 1) * inputs["planes"][:, :1])
+    value = (inputs["texture"][0, 0, :1] * inputs["planes"][:, 1:]).sin()
+    return weight * value, weight, (weight * value).detach() * 0 + weight
+
+
+def list_inputs(sets, pixels):
+    generator = torch.Generator().manual_seed(3)
+    return {
+        "planes": torch.rand(1, 2, 1, pixels, generator=generator, dtype=torch.float64),
+        "decay": torch.rand(sets, 1, 1, 1, generator=generator, dtype=torch.float64),
+        "texture": torch.rand(1, 1, 4, generator=generator, dtype=torch.float64),
+    }
+
+
+@pytest.mark.parametrize("with_texture", [False, True])
+@pytest.mark.parametrize("sets", [1, 3])
+def test_parts_and_groups_of_taps_change_nothing(monkeypatch, sets, with_texture):
+    inputs = list_inputs(sets, 103)
+    results = []
+    for part, taps in ((1 << 16, 1), (40, 1), (1 << 16, 4), (30, 3)):
+        monkeypatch.setattr("torchblur.ops.taps._PART", part)
+        monkeypatch.setattr("torchblur.ops.taps._LEAST_PART", 8)
+        monkeypatch.setattr("torchblur.ops.taps._TAPS_PER_CALL", {"cpu": taps})
+        leaves = {k: v.clone() for k, v in inputs.items()}
+        wanted = [leaves[k] for k in inputs if with_texture or k != "texture"]
+        for leaf in wanted:
+            leaf.requires_grad_()
+        color, weight, peak = sum_taps(list_tap, None, 10, leaves, num_maxima=1, num_pixels=103)
+        (color.square().sum() + (weight * peak).sum()).backward()
+        results.append([color, weight, peak, *(leaf.grad for leaf in wanted)])
+    for other in results[1:]:
+        for ours, theirs in zip(other, results[0], strict=True):
+            assert ours.shape == theirs.shape
+            assert torch.allclose(ours, theirs, rtol=1e-10, atol=1e-12)
+
+
+def test_no_part_is_larger_than_it_may_be(monkeypatch):
+    seen = []
+
+    def watching(index, count, inputs, options):
+        seen.append(inputs["planes"].shape[-1])
+        return (inputs["planes"] * inputs["decay"],)
+
+    monkeypatch.setattr("torchblur.ops.taps._PART", 60)
+    monkeypatch.setattr("torchblur.ops.taps._LEAST_PART", 8)
+    sum_taps(watching, None, 2, list_inputs(3, 103), num_pixels=103)
+    sizes = [size for size in seen if size != 103]  # the first call finds out what it returns
+    assert sizes
+    assert max(sizes) <= 20
+    assert sum(sizes) == 2 * 103
+
+
+@pytest.mark.slow
+def test_groups_of_taps_compiled(monkeypatch):
+    monkeypatch.setattr("torchblur.ops.taps._TAPS_PER_CALL", {"cpu": 4})
+    inputs = {k: v.float() for k, v in list_inputs(1, 103).items()}
+    results = []
+    for engine in ("eager", "compiled"):
+        leaves = {k: v.clone().requires_grad_() for k, v in inputs.items()}
+        color, weight, peak = sum_taps(
+            list_tap, None, 10, leaves, engine, num_maxima=1, num_pixels=103
+        )
+        (color.square().sum() + (weight * peak).sum()).backward()
+        results.append([color, weight, peak, *(leaf.grad for leaf in leaves.values())])
+    for ours, theirs in zip(*results, strict=True):
+        assert torch.allclose(ours, theirs, rtol=1e-4, atol=1e-5)

@@ -38,6 +38,10 @@ TapFunction = Callable[[Tensor, Tensor, Inputs, Any], Added]
 """``tap(index, count, inputs, options)``: index and count are 0-d float tensors."""
 
 _PART = 1 << 16  # pixels; the planes of so many fill a CPU's cache of the second level
+_LEAST_PART = 1 << 10  # pixels; with fewer, calls cost more than what they do
+_TAPS_PER_CALL = {"cpu": 1, "cuda": 4}
+"""Taps that one kernel adds: on a GPU each pass over the planes serves several. More of them take
+longer to compile."""
 
 
 def sum_taps(
@@ -156,9 +160,9 @@ def _floating(inputs: Inputs) -> Tensor:
 
 @dataclass(frozen=True)
 class _Kernel:
-    """One tap, forward and backward, eager or compiled."""
+    """Some taps, forward and backward, eager or compiled."""
 
-    add: Callable[[Planes, Tensor, Tensor, Inputs], Planes]
+    add: Callable[[Planes, Planes, Tensor, Inputs], Planes]
     pull: Callable[..., tuple[Inputs, Planes]]
 
 
@@ -177,9 +181,12 @@ class _Sum:
 
     def parts(self, like: Tensor) -> list[slice | None]:
         """Return parts of about equal size; [None] for all pixels at once."""
-        if self.num_pixels is None or self.num_pixels <= _PART or like.device.type != "cpu":
+        if self.num_pixels is None or like.device.type != "cpu":
             return [None]
-        count = -(-self.num_pixels // _PART)
+        sets = max(shape[0] for shape in self.form.shapes)
+        count = min(-(-self.num_pixels * sets // _PART), self.num_pixels // _LEAST_PART)
+        if count <= 1:
+            return [None]
         ends = [self.num_pixels * i // count for i in range(count + 1)]
         return [slice(start, stop) for start, stop in itertools.pairwise(ends)]
 
@@ -252,9 +259,11 @@ def _pull(job: _Sum, named: Inputs, wanted: Sequence[str], rest: Sequence[Tensor
     others = {name: tensor for name, tensor in named.items() if name not in leaves}
     totals = {name: torch.zeros_like(tensor) for name, tensor in leaves.items()}
     taken = tuple(torch.zeros_like(peak, dtype=torch.bool) for peak in peaks)
-    indices, number = _indices(job.num_samples, _floating(named))
-    for index in indices:
-        totals, taken = job.kernel.pull(totals, taken, index, number, leaves, others, grads, peaks)
+    groups, number = _groups(job.num_samples, _floating(named))
+    for indices in groups:
+        totals, taken = job.kernel.pull(
+            totals, taken, indices, number, leaves, others, grads, peaks
+        )
     return totals
 
 
@@ -262,33 +271,55 @@ def _pull(job: _Sum, named: Inputs, wanted: Sequence[str], rest: Sequence[Tensor
 def _sum(job: _Sum, inputs: Inputs) -> Planes:
     like = _floating(inputs)
     inputs = {name: tensor.detach() for name, tensor in inputs.items()}
-    indices, number = _indices(job.num_samples, like)
+    groups, number = _groups(job.num_samples, like)
     whole = job.form.start(like)
     for part in job.parts(like):
         cut = {name: job.part(tensor, part) for name, tensor in inputs.items()}
         sums = tuple(job.part(plane, part) for plane in whole)
-        for index in indices:
-            sums = job.kernel.add(sums, index, number, cut)
+        for indices in groups:
+            sums = job.kernel.add(sums, indices, number, cut)
         whole = tuple(job.put(*pair, part) for pair in zip(whole, sums, strict=True))
     return whole
 
 
-def _indices(num_samples: int, like: Tensor) -> tuple[Planes, Tensor]:
-    """Return the taps' indices and their number as 0-d tensors, made without waiting."""
+def _groups(num_samples: int, like: Tensor) -> tuple[list[Planes], Tensor]:
+    """Return the taps' indices, some at a time, and their number, made without waiting.
+
+    What is left over comes one at a time, so that there are two kernels for any number.
+    """
     numbers = torch.arange(num_samples + 1, device=like.device).to(like.dtype)
-    return numbers[:-1].unbind(0), numbers[-1]
+    indices, size = numbers[:-1].unbind(0), _TAPS_PER_CALL.get(like.device.type, 1)
+    full = num_samples - num_samples % size
+    groups = [indices[i : i + size] for i in range(0, full, size)]
+    return groups + [(index,) for index in indices[full:]], numbers[-1]
 
 
 @functools.lru_cache(maxsize=128)
 def _kernel(tap: TapFunction, options: Hashable, engine: Engine, num_summed: int) -> _Kernel:
-    """Return the functions of one tap; one object for each structure."""
+    """Return the functions of some taps; one object for each structure."""
 
-    def add(sums: Planes, index: Tensor, count: Tensor, inputs: Inputs) -> Planes:
-        pairs = tuple(zip(sums, _flat(tap(index, count, inputs, options)), strict=True))
-        total = tuple(s + a for s, a in pairs[:num_summed])
-        return total + tuple(torch.maximum(s, a) for s, a in pairs[num_summed:])
+    def add(sums: Planes, indices: Planes, count: Tensor, inputs: Inputs) -> Planes:
+        for index in indices:
+            pairs = tuple(zip(sums, _flat(tap(index, count, inputs, options)), strict=True))
+            total = tuple(s + a for s, a in pairs[:num_summed])
+            sums = total + tuple(torch.maximum(s, a) for s, a in pairs[num_summed:])
+        return sums
 
     def pull(  # noqa: PLR0913 - a closed function: all it touches is passed
+        totals: Inputs,
+        taken: Planes,
+        indices: Planes,
+        count: Tensor,
+        wanted: Inputs,
+        others: Inputs,
+        grads: Planes,
+        peaks: Planes,
+    ) -> tuple[Inputs, Planes]:
+        for index in indices:
+            totals, taken = pull_one(totals, taken, index, count, wanted, others, grads, peaks)
+        return totals, taken
+
+    def pull_one(  # noqa: PLR0913
         totals: Inputs,
         taken: Planes,
         index: Tensor,

@@ -1,0 +1,125 @@
+import dataclasses
+
+import pytest
+import torch
+
+from torchblur.filters import get_filter
+from torchblur.frame import Frame
+from torchblur.ops import gather as gather_module
+from torchblur.testing.frames import random_frame
+
+FILTERS = ("guertin2014", "jimenez2014", "line", "mcguire2012", "notes2025", "sousa2013", "tan2022")
+
+
+def partly_moving(batch_size=1, seed=0):
+    frame = random_frame(48, 220, batch_size=batch_size, speed=9.0, seed=seed)
+    velocity = frame.velocity.clone()
+    velocity[:, :, :12] = 0
+    velocity[..., 30:] = 0
+    return dataclasses.replace(frame, velocity=velocity)
+
+
+def make(name, **params):
+    tiles = {} if name == "line" else {"tile_size": 10}
+    return get_filter(name)(num_samples=7, **tiles, **params)
+
+
+def without_notices(blur):
+    # Tan 2022 says that it goes on without ids and without a revealed layer.
+    blur._told = {"normal", "object_id", "revealed"}
+    return blur
+
+
+def work_of(monkeypatch, blur, frame):
+    """Return the result and how many pixels went through each gather."""
+    counts = []
+    original = gather_module.sum_taps
+
+    def counting(*args, num_pixels=None, **kwargs):
+        counts.append(num_pixels)
+        return original(*args, num_pixels=num_pixels, **kwargs)
+
+    monkeypatch.setattr(gather_module, "sum_taps", counting)
+    with torch.no_grad():
+        image = blur(frame)
+    monkeypatch.undo()
+    return image, counts
+
+
+@pytest.mark.parametrize("name", [n for n in FILTERS if n != "tan2022"])
+def test_cost_follows_what_moves(monkeypatch, name):
+    frame = partly_moving()
+    pixels = frame.size[0] * frame.size[1]
+    image, counts = work_of(monkeypatch, make(name), frame)
+    assert counts
+    assert max(counts) < 0.45 * pixels
+    assert torch.equal(image[..., 60:], frame.color[..., 60:])
+    assert not torch.allclose(image[..., :30], frame.color[..., :30])
+
+
+@pytest.mark.parametrize("name", FILTERS)
+def test_nothing_is_gathered_where_nothing_moves(monkeypatch, name):
+    frame = partly_moving()
+    still = dataclasses.replace(frame, velocity=torch.zeros_like(frame.velocity))
+    image, counts = work_of(monkeypatch, without_notices(make(name)), still)
+    if name != "tan2022":  # its ray mask looks at depths and ids
+        assert not any(counts)
+    assert torch.equal(image, frame.color)
+
+
+@pytest.mark.parametrize("batch_size", [1, 2])
+@pytest.mark.parametrize("name", FILTERS)
+def test_what_moves_alone_gives_what_all_pixels_give(monkeypatch, name, batch_size):
+    frame = partly_moving(batch_size)
+    results = []
+    for dense in (False, True):
+        if dense:
+            monkeypatch.setattr("torchblur.ops.pixels._DENSE", -1.0)
+            monkeypatch.setattr("torchblur.filters.reconstruction._ALMOST_ALL", -1.0)
+        blur = without_notices(make(name))
+        leaf = frame.color.clone().requires_grad_()
+        given = dataclasses.replace(frame, color=leaf)
+        image = blur(given)
+        image.square().sum().backward()
+        grads = [p.grad for p in blur.parameters() if p.grad is not None]
+        assert grads
+        results.append([image.detach(), leaf.grad, *grads])
+    for sparse, dense in zip(*results, strict=True):
+        assert torch.allclose(sparse, dense, rtol=1e-5, atol=1e-6)
+
+
+@pytest.mark.parametrize("kind", ["per image", "per pixel", "sets"])
+@pytest.mark.parametrize("name", ["guertin2014", "jimenez2014", "mcguire2012", "notes2025"])
+def test_parameters_of_all_shapes(monkeypatch, name, kind):
+    frame = partly_moving(2 if kind == "per image" else 1)
+    parameter = "depth_level"
+    value = torch.tensor([0.3, 0.8]).view(2, 1, 1, 1)
+    if kind == "per pixel":
+        value = torch.linspace(0.2, 0.9, 220).expand(1, 1, 48, 220)
+    with torch.no_grad():
+        image = make(name)(frame, **{parameter: value})
+        monkeypatch.setattr("torchblur.ops.pixels._DENSE", -1.0)
+        monkeypatch.setattr("torchblur.filters.reconstruction._ALMOST_ALL", -1.0)
+        whole = make(name)(frame, **{parameter: value})
+        for i in range(2) if kind != "per pixel" else ():
+            single = frame.map(lambda t, i=i: t[i : i + 1]) if kind == "per image" else frame
+            alone = make(name)(single, **{parameter: float(value[i])})
+            assert torch.allclose(image[i : i + 1], alone, atol=1e-5)
+    assert torch.allclose(image, whole, atol=1e-6)
+
+
+def test_the_fast_class_averages_plainly():
+    frame = random_frame(40, 80, speed=0.0)
+    uniform = torch.zeros_like(frame.velocity)
+    uniform[:, 0] = 8.0
+    frame = Frame(color=frame.color, velocity=uniform, depth=frame.depth)
+    layers = make("jimenez2014", noise="none").layers(frame)
+    assert (layers["tile_class"] == 1).all()
+    steps = (torch.arange(4) + 0.5) / 4 * 2.0
+    columns = torch.arange(80.0)
+    expected = sum(
+        frame.color[..., (columns + side * step).round().clamp(0, 79).long()]
+        for step in steps
+        for side in (1, -1)
+    )
+    assert torch.allclose(layers["color"], expected / 8, atol=1e-6)
