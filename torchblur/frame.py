@@ -182,6 +182,19 @@ class Frame:
         self._check_agreement()
         self._check_values(on_invalid)
 
+    @classmethod
+    def unchecked(cls, **layers: Tensor) -> Frame:
+        """Return a frame of layers that are known to be right: no value of them is looked at.
+
+        Args:
+            **layers: As of `Frame`, with four dimensions.
+        """
+        frame = object.__new__(cls)
+        empty = {field.name: None for field in dataclasses.fields(cls)}
+        for name, value in (empty | {"source": ""} | layers).items():
+            object.__setattr__(frame, name, value)
+        return frame
+
     # -- sizes ---------------------------------------------------------------------------------
 
     @property

@@ -23,7 +23,7 @@ from torchblur.filters.revealed import RevealedBackgroundConfig
 from torchblur.frame import Frame, Shutter
 from torchblur.ops.gather import Engine, Inputs, Lookup, Planes, gather_lists, weighted
 from torchblur.ops.noise import NoiseKind, dither_2x2, noise_plane
-from torchblur.ops.pixels import select
+from torchblur.ops.pixels import select, takes_all_pixels
 from torchblur.ops.spread import Mirror, SpreadForm, TapPair, depth_shares, mirror, spread_weight
 from torchblur.ops.tiles import neighbor_min, tile_lookup, tile_min
 from torchblur.ops.velocity import direction, length, quantize_uint8
@@ -263,6 +263,13 @@ def _sums(
     color = alpha = tile_class.new_zeros(())
     pixels = part.pixels
     for number, tap in ((1, _plain_pair), (2, _pair)):
+        if takes_all_pixels():
+            sums = gather_lists(tap, options, pairs, inputs, pixels, engine)
+            color, alpha = (
+                torch.where(tile_class == number, new, whole)
+                for whole, new in zip((color, alpha), sums, strict=True)
+            )
+            continue
         chosen = (tile_class == number).flatten().nonzero()[:, 0]
         if chosen.shape[0] == 0 and (number == 1 or color.ndim):
             continue

@@ -15,7 +15,7 @@ from torchblur.frame import Frame, Shutter
 from torchblur.ops.cubic import read_cubic
 from torchblur.ops.gather import Inputs, Lookup, Planes, read
 from torchblur.ops.noise import NoiseKind, noise_plane
-from torchblur.ops.pixels import PixelList, select
+from torchblur.ops.pixels import PixelList, select, takes_all_pixels
 from torchblur.ops.tiles import neighbor_max, tile_lookup, tile_max, tile_offset
 from torchblur.ops.velocity import clamp_length, direction, half_velocity, length, quantize_uint8
 from torchblur.params import Param
@@ -412,13 +412,15 @@ def _moving_tiles(frame: Frame, values: Values, neighborhood: Tensor) -> Tensor:
     if least.ndim == 4:
         least = least.amin((2, 3), keepdim=True)
     moving: Tensor = (length(neighborhood.detach()) > least).to(frame.dtype)
-    if torch.is_grad_enabled() and not bool(moving.any()):
+    if torch.is_grad_enabled() and not takes_all_pixels() and not bool(moving.any()):
         moving[..., 0, 0] = 1  # so that there is a graph
     return moving
 
 
 def _moving_pixels(dominant: Tensor, least: Tensor) -> Tensor | None:
     """Return which pixels of a list move, for any set; None: so many that all may be taken."""
+    if takes_all_pixels():
+        return None
     moving = (length(dominant.detach()) > least).any(0).flatten()
     count = int(moving.sum())
     if count > _ALMOST_ALL * moving.shape[0] or (count == 0 and torch.is_grad_enabled()):
@@ -474,7 +476,9 @@ WEIGHT_PARAMETERS = (
 
 def is_one(value: Tensor) -> bool:
     """Whether an exponent is 1 and needs no gradient, so that its power can be left out."""
-    return not (value.requires_grad and torch.is_grad_enabled()) and bool((value == 1).all())
+    if takes_all_pixels() or (value.requires_grad and torch.is_grad_enabled()):
+        return False
+    return bool((value == 1).all())
 
 
 class Tap(NamedTuple):

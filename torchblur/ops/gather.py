@@ -16,7 +16,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from torchblur.ops.pixels import PixelList
+from torchblur.ops.pixels import PixelList, takes_all_pixels
 from torchblur.ops.taps import Engine, Inputs, Planes, TapFunction, sum_taps
 
 __all__ = [
@@ -107,8 +107,9 @@ def gather_lists(
     Differentiable: as `gather`.
     """
     inputs = pixels.with_textures(lists)
+    count = None if takes_all_pixels() else pixels.count  # parts would make a graph very long
     return sum_taps(
-        tap, options, num_samples, inputs, engine, num_maxima=num_maxima, num_pixels=pixels.count
+        tap, options, num_samples, inputs, engine, num_maxima=num_maxima, num_pixels=count
     )
 
 

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import functools
 from typing import Literal
 
+import numpy as np
+import numpy.typing as npt
 import torch
 from torch import Tensor
 
@@ -64,14 +67,20 @@ def halton_plane(
     Reference: Guertin 2014, section 4.5, asks for a Halton sequence and does not say which pixel
         gets which point; this shuffle is ours.
     """
-    generator = torch.Generator().manual_seed(seed * len(_BASES) + stream)
-    order = torch.randperm(_TILE * _TILE, generator=generator)
-    tile = halton(_TILE * _TILE, _BASES[stream])[order].reshape(_TILE, _TILE)
-    tile = tile.to(device=like.device, dtype=like.dtype)
+    tile = torch.tensor(_halton_tile(stream, seed), dtype=like.dtype, device=like.device)
     height, width = like.shape[-2:] if pixels is None else pixels.size
     repeated = tile.repeat(-(-height // _TILE), -(-width // _TILE))[:height, :width]
     plane = repeated[None, None]
     return plane if pixels is None else pixels.pack(plane)
+
+
+@functools.lru_cache(maxsize=64)
+def _halton_tile(stream: int, seed: int) -> npt.NDArray[np.float64]:
+    """Return the shuffled tile; an array, as no tensor of one trace may get into another."""
+    generator = torch.Generator().manual_seed(seed * len(_BASES) + stream)
+    order = torch.randperm(_TILE * _TILE, generator=generator)
+    tile: npt.NDArray[np.float64] = halton(_TILE * _TILE, _BASES[stream])[order].numpy()
+    return tile.reshape(_TILE, _TILE)
 
 
 def interleaved_gradient_noise(

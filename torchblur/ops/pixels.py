@@ -8,15 +8,37 @@ wanted pixels.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from contextvars import ContextVar
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
-__all__ = ["PixelList", "select"]
+__all__ = ["PixelList", "all_pixels", "select", "takes_all_pixels"]
 
 _DENSE = 0.8  # share of wanted pixels from which all are done: packing costs, too
+_takes_all: ContextVar[bool] = ContextVar("takes_all", default=False)
+
+
+@contextmanager
+def all_pixels() -> Iterator[None]:
+    """Let filters work on all pixels, also on those that stand still.
+
+    No size and no branch then depends on what is in the image, as a graph that is recorded once
+    (`torch.export`, CUDA graphs) needs it. The result is the same but for rounding.
+    """
+    before = _takes_all.set(True)
+    try:
+        yield
+    finally:
+        _takes_all.reset(before)
+
+
+def takes_all_pixels() -> bool:
+    """Return whether this is inside of `all_pixels`."""
+    return _takes_all.get()
 
 
 def select(packed: Tensor, chosen: Tensor) -> Tensor:
@@ -77,6 +99,8 @@ class PixelList:
             wanted: bool, (B, 1, H, W).
         """
         whole = cls.all(wanted)
+        if takes_all_pixels():
+            return whole
         index = wanted.flatten().nonzero()[:, 0]
         return whole if index.shape[0] > _DENSE * whole.count else cls(*whole.shape, index)
 
