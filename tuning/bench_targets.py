@@ -185,7 +185,7 @@ def _on_gpu(guertin: Case, device: str) -> list[Target]:
 
 def _ratios(guertin: Case, shrink: int) -> list[Target]:
     some, still = guertin.but(moving=10), guertin.but(moving=0)
-    backward = guertin.but(what="backward")
+    backward, step = guertin.but(what="backward"), guertin.but(what="parameters")
     sets = guertin.but(width=128 // shrink, height=128 // shrink, sets=32)
     apart = sets.but(apart=True)
     small = backward.but(width=1280 // shrink, height=720 // shrink)
@@ -193,7 +193,8 @@ def _ratios(guertin: Case, shrink: int) -> list[Target]:
     return [
         _ratio("10 % of the area moves, over all of it", 0.2, some, guertin),
         _ratio("nothing moves, over all of it", 0.03, still, guertin),
-        _ratio("forward and backward, over forward", 4.0, backward, guertin),
+        _ratio("forward and backward of a fit (all parameters), over forward", 4.0, step, guertin),
+        _ratio("the same, with the gradient of the color", 4.0, backward, guertin),
         Target(
             name="forward and backward, over forward: peak memory",
             unit="",

@@ -88,16 +88,21 @@ def _one_call(
 
     def forward() -> Tensor:
         with torch.no_grad():
-            return blur.layers(frame, **given)["color"]
+            return _color(blur(frame, **given))
 
     def backward() -> None:
         for leaf in (color, *leaves):
             leaf.grad = None
-        result = blur.layers(frame, **given)["color"]
+        result = _color(blur(frame, **given))
         # A gradient that differs from pixel to pixel, as that of a loss does, and costs nothing.
         result.backward(result.detach())
 
     return forward if case.what == "forward" else backward
+
+
+def _color(result: Tensor | tuple[Tensor, History]) -> Tensor:
+    """Return the image; a filter with a memory returns that too."""
+    return result if isinstance(result, Tensor) else result[0]
 
 
 def _history(blur: BlurFilter, frame: Frame) -> History | None:
