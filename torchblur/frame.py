@@ -25,7 +25,7 @@ import warnings
 from collections import abc
 from collections.abc import Callable, Iterator
 from dataclasses import InitVar, dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 from torch import Tensor
@@ -183,15 +183,15 @@ class Frame:
         self._check_values(on_invalid)
 
     @classmethod
-    def unchecked(cls, **layers: Tensor) -> Frame:
+    def unchecked(cls, **fields: Any) -> Frame:
         """Return a frame of layers that are known to be right: no value of them is looked at.
 
         Args:
-            **layers: As of `Frame`, with four dimensions.
+            **fields: As of `Frame`, layers with four dimensions.
         """
         frame = object.__new__(cls)
-        empty = {field.name: None for field in dataclasses.fields(cls)}
-        for name, value in (empty | {"source": ""} | layers).items():
+        empty = dict.fromkeys(field.name for field in dataclasses.fields(cls))
+        for name, value in (empty | {"source": ""} | fields).items():
             object.__setattr__(frame, name, value)
         return frame
 
@@ -249,6 +249,11 @@ class Frame:
         return {name: t for name in _CHANNELS if (t := getattr(self, name)) is not None}
 
     # -- other frames --------------------------------------------------------------------------
+
+    def replaced(self, **layers: Tensor) -> Frame:
+        """Return the frame with other layers, which are known to be right and not checked."""
+        kept = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
+        return Frame.unchecked(**(kept | layers))
 
     def only(self, *names: str) -> Frame:
         """Return the frame with these layers of it alone, and color and velocity."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from typing import Any, NamedTuple
 
@@ -150,7 +149,7 @@ def _clean_edges(frame: Frame, values: Values) -> Frame:
     velocity = torch.where(beside, torch.cat(motion, 1), frame.velocity)
     if values.edge_motion == "surface":
         depth = torch.where(beside, nearest, depth)
-    return dataclasses.replace(frame, velocity=velocity, depth=depth)
+    return frame.replaced(velocity=velocity, depth=depth)
 
 
 def _around(plane: Tensor) -> Tensor:
@@ -295,6 +294,12 @@ def _means(
     totals: tuple[Tensor, ...], count: Tensor, line: Line, area: Tensor | None, values: Values
 ) -> Sums:
     *sums, alpha = (total / count for total in totals)
+    if sums[0].shape[1] > 3:
+        back, own_, seen, hid = sums[0].split((3, 3, 1, 1), 1)
+        known = seen > _TRACE
+        g = torch.where(known, hid / torch.where(known, seen, 1.0), 0.0)
+        sums[0] = values.background_gain * (back + g * own_)
+        sums[1] = values.background_gain * (sums[1] + torch.where(known, hid, 0.0))
     if area is not None:
         alpha = alpha * (1 + area)
     alpha = saturate(values.alpha_gain * alpha, values.softness)

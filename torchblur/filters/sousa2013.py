@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from typing import Annotated, Any, Literal, NamedTuple
 
 import torch
@@ -159,7 +158,7 @@ def _layers(frame: Frame, values: Values, engine: Engine) -> dict[str, Tensor]:
     if values.encoding == "packed":
         packed = quantize_linear(frame.finite_depth(), values.depth_range)
         # A depth of 0 is none: the least code stands for a quarter of a step.
-        frame = dataclasses.replace(frame, depth=torch.maximum(packed, values.depth_range / 1020))
+        frame = frame.replaced(depth=torch.maximum(packed, values.depth_range / 1020))
     center = Shutter(1, values.shutter_position).center
     layers = {"tile_max": tiles.own, "neighbor_max": tiles.neighborhood}
     scale: float | Tensor = 1.0
@@ -169,7 +168,7 @@ def _layers(frame: Frame, values: Values, engine: Engine) -> dict[str, Tensor]:
         color, weight = _pass(frame, shrunk, dominant, center, number, values, engine)
         layers.setdefault("first_pass", color)
         layers.setdefault("weight", weight)
-        frame = dataclasses.replace(frame, color=color)
+        frame = frame.replaced(color=color)
         scale, center = scale * values.pass_spread / values.num_samples, 0
     return layers | {"color": color}
 
