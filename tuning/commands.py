@@ -19,6 +19,7 @@ from typer.core import TyperGroup
 from tuning.bench_command import bench
 from tuning.console import metrics_table, print_error, print_warning, results, show_progress
 from tuning.evidence_commands import ablate, study
+from tuning.export_command import export
 from tuning.options import ConventionName, NoCompile, Overwrite, Scheduler, Set
 from tuning.race_command import race
 from tuning.render_command import render
@@ -312,6 +313,7 @@ def compare(
         results.print(f"page: {output}", soft_wrap=True)
 
 
+app.command()(export)
 app.command()(ablate)
 app.command()(study)
 app.command()(race)
