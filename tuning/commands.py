@@ -18,6 +18,7 @@ from typer.core import TyperGroup
 
 from tuning.bench_command import bench
 from tuning.console import metrics_table, print_error, print_warning, results, show_progress
+from tuning.crossfit_command import crossfit
 from tuning.evidence_commands import ablate, study
 from tuning.export_command import export
 from tuning.options import ConventionName, NoCompile, Overwrite, Scheduler, Set
@@ -317,6 +318,7 @@ app.command()(export)
 app.command()(ablate)
 app.command()(study)
 app.command()(race)
+app.command()(crossfit)
 app.command()(bench)
 
 

@@ -37,6 +37,7 @@ __all__ = [
     "free_names",
     "load_tune_config",
     "resolve",
+    "resolve_filter",
 ]
 
 _SHUTTER_KEYS = ("shutter", "shutter_position")
@@ -134,10 +135,7 @@ def resolve(
             parameter without a gradient.
     """
     folder = Path.cwd() if folder is None else folder
-    filter_spec = _without_preset(config.filter, place, folder)
-    filter_spec = _checked_params(filter_spec, place)
-    for name, limits in filter_spec.free.items():
-        _check_range(filter_spec, name, limits, f"{place}: " if place else "")
+    filter_spec = resolve_filter(config.filter, place, folder)
     if config.objective.reduction != "mean" and config.data.is_weighted:
         raise ConfigError(
             "weights of the data (`weight`, crops.unbiased) belong to a mean, got "
@@ -150,6 +148,23 @@ def resolve(
     names = [free_names(config, index, place) for index in range(len(config.methods))]
     check_costs(config, names, place)
     return config
+
+
+def resolve_filter(spec: FilterSpec, place: str, folder: Path) -> FilterSpec:
+    """Check a filter's parameters and ranges, and replace a preset by its content.
+
+    Args:
+        spec: The filter.
+        place: Name for messages.
+        folder: What a preset's path is relative to.
+
+    Raises:
+        ConfigError: unknown filter or parameter, value out of range.
+    """
+    spec = _checked_params(_without_preset(spec, place, folder), place)
+    for name, limits in spec.free.items():
+        _check_range(spec, name, limits, f"{place}: " if place else "")
+    return spec
 
 
 def free_names(config: TuneConfig, index: int, place: str = "") -> tuple[str, ...]:

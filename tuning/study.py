@@ -37,7 +37,16 @@ from tuning.study_rays import ray_facts, ray_mask_of, shutter_values, with_revea
 FACTS = "ray mask"
 """Name of the variant that stands for figures of the data themselves."""
 
-__all__ = ["FACTS", "Row", "mean_of", "part_file", "picture_file", "run_study", "slug"]
+__all__ = [
+    "FACTS",
+    "Row",
+    "mean_of",
+    "part_file",
+    "picture_file",
+    "run_study",
+    "slug",
+    "source_hash",
+]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -114,7 +123,7 @@ def part_file(
         variant.model_dump_json(exclude={"only"}),
         json.dumps([config.masks, config.mask_params], sort_keys=True),
         identity_of(item),
-        _source_hash(),
+        source_hash(),
     )
     digest = hashlib.sha256("\n".join(parts).encode()).hexdigest()[:16]
     return folder / "parts" / f"{slug(item.name)}.{slug(variant.name)}.{digest}.json"
@@ -285,7 +294,8 @@ def slug(name: str) -> str:
 
 
 @functools.cache
-def _source_hash() -> str:
+def source_hash() -> str:
+    """Return a hash of the source of filters, metrics and renderer: what figures depend on."""
     digest = hashlib.sha256()
     root = Path(torchblur.__file__).parent
     files = [*root.glob("*.py")]

@@ -154,7 +154,7 @@ class TestRun:
         edited(study, "{num_samples: 15}", "{num_samples: 9}")
         assert row_of(run_study(load_study_config(study), folder), "line") != row_of(first, "line")
         assert len(calls) == 2
-        monkeypatch.setattr(tuning.study, "_source_hash", lambda: "another filter")
+        monkeypatch.setattr(tuning.study, "source_hash", lambda: "another filter")
         run_study(config, folder)
         assert len(calls) == 3
 

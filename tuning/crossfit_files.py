@@ -1,0 +1,179 @@
+"""What a crossfit is written to: JSON with every figure, tables, points, a plot."""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+import io
+import json
+from collections.abc import Sequence
+from importlib.metadata import version
+from pathlib import Path
+
+from torchblur.io.paths import output_file
+from tuning.crossfit import Crossfit, Fold
+from tuning.crossfit_config import CrossfitConfig
+from tuning.crossfit_plots import plot_crossfit
+from tuning.crossfit_summary import MEAN, Row, summary_of, verdicts
+from tuning.crossfit_tiles import Figure
+from tuning.outputs import make_folders
+
+__all__ = ["COLUMNS", "TARGETS", "cell", "note_of", "write_crossfit"]
+
+COLUMNS = {
+    "flip": ("FLIP", ".4f"),
+    "flip_ratio": ("to line", ".3f"),
+    "psnr": ("PSNR", ".2f"),
+    "ssim": ("SSIM", ".4f"),
+    "flip_band": ("FLIP borders", ".4f"),
+    "flip_band_ratio": ("to line, borders", ".3f"),
+    "psnr_band": ("PSNR borders", ".2f"),
+    "psnr_band_gain": ("gain over line, borders", "+.2f"),
+    "ssim_band": ("SSIM borders", ".4f"),
+}
+"""Heading and format of each figure in the tables."""
+
+TARGETS = {
+    "flip_ratio": "FLIP at most {:g} of line's",
+    "flip_band_ratio": "FLIP at borders at most {:g} of line's",
+    "psnr_gain": "PSNR at least {:g} dB above line's",
+    "psnr_band_gain": "PSNR at borders at least {:g} dB above line's",
+}
+"""What targets ask for."""
+
+
+def write_crossfit(folder: Path, config: CrossfitConfig, found: Crossfit) -> list[Path]:
+    """Write `tables.md`, `crossfit.json`, `points.csv` and `ratios.png`; older ones go.
+
+    Args:
+        folder: Where to.
+        config: The crossfit.
+        found: What `run_crossfit` returned.
+
+    Raises:
+        OutputError: a file cannot be written.
+    """
+    rows = summary_of(config, found)
+    texts = {
+        "tables.md": _markdown(config, found, rows),
+        "crossfit.json": _json(config, found, rows),
+        "points.csv": _csv(rows),
+    }
+    make_folders([folder / name for name in texts])
+    for name, text in texts.items():
+        with output_file(folder / name, overwrite=True) as temporary:
+            temporary.write_text(text, encoding="utf-8")
+    plot = folder / "ratios.png"
+    plot_crossfit(plot, config, found, rows)
+    return [*(folder / name for name in texts), plot]
+
+
+def cell(row: Row, name: str, *, interval: bool = True) -> str:
+    """Return a figure as text, "–" where there is none; with its interval if there is one."""
+    figure, form = row.figures[name], COLUMNS[name][1]
+    if figure.value is None:
+        return "–"
+    text = format(figure.value, form)
+    if not interval or figure.low is None or figure.high is None:
+        return text
+    return f"{text} ({format(figure.low, form)} to {format(figure.high, form)})"
+
+
+def note_of(config: CrossfitConfig) -> str:
+    """Return what the tables show, in a few sentences."""
+    boot = config.bootstrap
+    return (
+        "Tuned: fitted to all cases but the one that is scored. Given: the values in the file, "
+        "not fitted. FLIP, SSIM and PSNR (linear, peak 1) over all pixels of a case's frames; "
+        "borders: the band that moving borders sweep. Intervals: "
+        f"{100 * boot.level:g} % of {boot.draws} draws of tiles of {boot.tile} px; ratios and "
+        "gains are between the same tiles. Intervals tell of these images, not of other scenes."
+    )
+
+
+def _markdown(config: CrossfitConfig, found: Crossfit, rows: Sequence[Row]) -> str:
+    lines = [f"# {config.title}", "", note_of(config), ""]
+    head = ["", *(label for label, _ in COLUMNS.values())]
+    for case in (MEAN, *config.data.cases):
+        heading = "Mean over the cases" if case == MEAN else case
+        own = [row for row in rows if row.case == case]
+        cells = [[row.label, *(cell(row, name) for name in COLUMNS)] for row in own]
+        lines += [f"## {heading}", "", *_table(head, cells)]
+    lines += _targets(config, found, list(rows))
+    fitted = [name for name, entry in config.filters.items() if entry.is_fitted]
+    if fitted:
+        lines += ["## Fits", ""]
+    for name in fitted:
+        lines += _fits([fold for fold in found.folds if fold.filter == name])
+    return "\n".join(lines)
+
+
+def _targets(config: CrossfitConfig, found: Crossfit, rows: list[Row]) -> list[str]:
+    if not config.targets:
+        return []
+    every = verdicts(config, found, rows)
+    lines = ["## Targets", "", "?: the interval reaches to the other side.", ""]
+    for target, limit in config.targets.items():
+        texts = {(v.filter, v.case): v.text for v in every if v.target == target}
+        names = dict.fromkeys(name for name, _ in texts)
+        cases = [*config.data.cases, MEAN]
+        head = [TARGETS[target].format(limit), *cases]
+        lines += _table(head, [[n, *(texts.get((n, c), "–") for c in cases)] for n in names])
+    return lines
+
+
+def _fits(folds: Sequence[Fold]) -> list[str]:
+    """Return a table of what the fits of a filter found: a column for each left-out case."""
+    head = [folds[0].filter, "start", *(f"without {fold.case}" for fold in folds)]
+    rows = [
+        [name, _text(folds[0].start[name]), *(_text(fold.tuned[name]) for fold in folds)]
+        for name in folds[0].start
+    ]
+    rows += [
+        ["*objective before*", "", *(f"{fold.start_objective:.4g}" for fold in folds)],
+        ["*objective after*", "", *(f"{fold.objective:.4g}" for fold in folds)],
+        ["*found by*", "", *(fold.chosen for fold in folds)],
+        ["*evaluations*", "", *(f"{fold.passes:.0f}" for fold in folds)],
+        ["*CPU s*", "", *(f"{fold.cpu_seconds:.0f}" for fold in folds)],
+    ]
+    return _table(head, rows)
+
+
+def _table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
+    lines = [_line(head), _line(["---", *["---:"] * (len(head) - 1)])]
+    return [*lines, *(_line(row) for row in rows), ""]
+
+
+def _line(values: Sequence[str]) -> str:
+    return "| " + " | ".join(value.replace("|", "\\|") for value in values) + " |"
+
+
+def _text(value: object) -> str:
+    return f"{value:.4g}" if isinstance(value, float) else str(value)
+
+
+def _json(config: CrossfitConfig, found: Crossfit, rows: list[Row]) -> str:
+    data = {
+        "title": config.title,
+        "torchblur": version("torchblur"),
+        "rows": [dataclasses.asdict(row) for row in rows],
+        "targets": [dataclasses.asdict(v) for v in verdicts(config, found, rows)],
+        "folds": [dataclasses.asdict(fold) for fold in found.folds],
+        "config": config.model_dump(mode="json"),
+    }
+    return json.dumps(data, indent=1, ensure_ascii=False) + "\n"
+
+
+def _csv(rows: Sequence[Row]) -> str:
+    buffer = io.StringIO()
+    writer = csv.writer(buffer, lineterminator="\n")
+    writer.writerow(["case", "filter", "variant", "metric", "value", "low", "high"])
+    for row in rows:
+        for name, figure in row.figures.items():
+            writer.writerow([row.case, row.filter, row.variant, name, *_ends(figure)])
+    return buffer.getvalue()
+
+
+def _ends(figure: Figure) -> list[str]:
+    values = (figure.value, figure.low, figure.high)
+    return ["" if value is None else f"{value:.6g}" for value in values]
