@@ -146,6 +146,10 @@ def tune(  # noqa: PLR0913 - each argument is an option
     workers: Annotated[
         int | None, typer.Option(metavar="N", min=1, help="The same, on N processes started here.")
     ] = None,
+    track: Annotated[
+        Path | None,
+        typer.Option(metavar="DIR", help="Log folder of TensorBoard: curves, figures, images."),
+    ] = None,
 ) -> None:
     """Fit a filter's parameters to reference renders.
 
@@ -157,18 +161,27 @@ def tune(  # noqa: PLR0913 - each argument is an option
     from tuning.distributed import RankZeroStoppedError, rank_here
     from tuning.fit import run_fit
     from tuning.printing import print_fit
+    from tuning.track import tracking
 
     overrides = [*(set_ or []), *([f"device={device}"] if device else [])]
     overrides += ["engine=eager"] if no_compile else []
     folder = output or Path("runs") / config.stem
     loaded = load_tune_config(config, overrides)
     try:
-        with show_progress() as progress, _cluster(scheduler, workers) as cluster:
-            result = run_fit(loaded, folder, resume, progress, overwrite=overwrite, cluster=cluster)
+        shown = track if rank_here() == 0 else None
+        with (
+            show_progress() as progress,
+            tracking(shown, folder, loaded, progress) as tracker,
+            _cluster(scheduler, workers) as cluster,
+        ):
+            told = tracker or progress
+            result = run_fit(loaded, folder, resume, told, overwrite=overwrite, cluster=cluster)
+            if tracker is not None:
+                tracker.finish(result)
     except RankZeroStoppedError as error:
         raise typer.Exit(_FAILED) from error
     except KeyboardInterrupt as error:
-        places = {"--scheduler": scheduler, "--workers": workers}
+        places = {"--scheduler": scheduler, "--workers": workers, "--track": track}
         again = shlex.join(_tune_again(config, folder, overrides, places))
         print_error(
             f"stopped (Ctrl-C); nothing but the step in flight is lost. Go on with: {again}"
