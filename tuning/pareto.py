@@ -89,9 +89,11 @@ def fit_pareto(
     for trial in journal.trials() if journal is not None else ():
         search.study.add_trial(trial)
     if folder is not None:
-        folder.drop_records(job.index, 0)
-        for trial in search.study.trials:
-            _log(folder, job, trial)
+        trials = search.study.trials
+        logged = folder.drop_records(job.index, len(trials))
+        for trial in trials:
+            if trial.number not in logged:
+                _log(folder, job, trial)
     stage = Stage(job.name, job.method.trials, progress, done=search.drawn)
     while search.drawn < job.method.trials:
         trials = search.round()

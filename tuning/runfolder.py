@@ -86,15 +86,19 @@ class RunFolder:
         lines = self.log_path.read_text(encoding="utf-8").splitlines()
         return [json.loads(line) for line in lines if line.strip()]
 
-    def drop_records(self, method: int, first_step: int) -> None:
+    def drop_records(self, method: int, first_step: int) -> set[int]:
         """Remove what was logged after the checkpoint that a method goes on from.
 
         Args:
-            method: Position of the method.
-            first_step: First step that will be done again. Later methods are dropped as well.
+            method: Position of the method. Later ones, which only follow a finished one, stay.
+            first_step: First step that will be done again.
+
+        Returns:
+            The steps of this method that are in the log.
         """
-        kept = [r for r in self.records() if _before(r, method, first_step)]
+        kept = [r for r in self.records() if _is_kept(r, method, first_step)]
         self.write("log.jsonl", "".join(json.dumps(record) + "\n" for record in kept))
+        return {record["step"] for record in kept if record.get("method") == method}
 
 
 @contextmanager
@@ -153,11 +157,8 @@ def trim_torn_line(path: Path) -> None:
         os.truncate(path, len(whole))
 
 
-def _before(record: dict[str, Any], method: int, step: int) -> bool:
-    position = record.get("method", -1)
-    if position != method:
-        return bool(position < method)
-    return bool(record.get("step", -1) < step)
+def _is_kept(record: dict[str, Any], method: int, step: int) -> bool:
+    return record.get("method") != method or bool(record["step"] < step)
 
 
 def _lock_or_refuse(descriptor: int, path: Path) -> None:

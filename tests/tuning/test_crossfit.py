@@ -337,6 +337,11 @@ class TestResume:
         assert len(list(tmp_path.glob("folds/*/fold.json"))) == 1
         assert timeless(run_crossfit(finished.config, tmp_path)) == timeless(finished.found)
         assert next(count) == 10  # one step was stopped; nine were made
+        for folder in (finished.folder, tmp_path):
+            (log,) = folder.glob("folds/guertin.without-two.*/log.jsonl")
+            records = [json.loads(line) for line in log.read_text().splitlines()]
+            steps = [(r["method"], r["step"]) for r in records]
+            assert steps == [(m, step) for m in (0, 1) for step in range(3)]
 
     def test_what_is_there_is_not_done_again(self, finished, monkeypatch):
         monkeypatch.setattr(tuning.crossfit, "prepare", None)
