@@ -37,7 +37,7 @@ def crossfit(
     """
     from tuning.crossfit import run_crossfit
     from tuning.crossfit_config import load_crossfit_config
-    from tuning.crossfit_files import COLUMNS, TARGETS, cell, note_of, write_crossfit
+    from tuning.crossfit_files import COLUMNS, TARGETS, UNSURE, cell, note_of, write_crossfit
     from tuning.crossfit_summary import MEAN, summary_of, verdicts
 
     folder = output or Path("runs") / config.stem
@@ -51,7 +51,7 @@ def crossfit(
     files = write_crossfit(folder, loaded, found)
     rows = summary_of(loaded, found)
     shown = ("flip", "flip_ratio", "psnr", "flip_band", "psnr_band", "psnr_band_gain")
-    labels = [COLUMNS[name][0].replace(" borders", "\nborders") for name in shown]
+    labels = [COLUMNS[name][0].replace(", b", " b").replace(" b", "\nb") for name in shown]
     table = plain_table("Mean over the cases that were left out", ("", *labels), right=labels)
     for row in rows:
         if row.case == MEAN:
@@ -65,5 +65,5 @@ def crossfit(
         for name in dict.fromkeys(name for name, _ in texts):
             table.add_row(name, *(texts.get((name, case), "–") for case in cases))
         results.print(table)
-    results.print(note_of(loaded))
+    results.print(note_of(loaded) + (f" {UNSURE}" if loaded.targets else ""))
     results.print(f"tables: {folder / 'tables.md'}, {len(files)} files", soft_wrap=True)

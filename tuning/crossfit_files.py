@@ -18,7 +18,7 @@ from tuning.crossfit_summary import MEAN, Row, summary_of, verdicts
 from tuning.crossfit_tiles import Figure
 from tuning.outputs import make_folders
 
-__all__ = ["COLUMNS", "TARGETS", "cell", "note_of", "write_crossfit"]
+__all__ = ["COLUMNS", "TARGETS", "UNSURE", "cell", "note_of", "write_crossfit"]
 
 COLUMNS = {
     "flip": ("FLIP", ".4f"),
@@ -40,6 +40,9 @@ TARGETS = {
     "psnr_band_gain": "PSNR at borders at least {:g} dB above line's",
 }
 """What targets ask for."""
+
+UNSURE = "Targets: “?” where the interval reaches to the other side."
+"""What a question mark says."""
 
 
 def write_crossfit(folder: Path, config: CrossfitConfig, found: Crossfit) -> list[Path]:
@@ -112,7 +115,7 @@ def _targets(config: CrossfitConfig, found: Crossfit, rows: list[Row]) -> list[s
     if not config.targets:
         return []
     every = verdicts(config, found, rows)
-    lines = ["## Targets", "", "?: the interval reaches to the other side.", ""]
+    lines = ["## Targets", "", UNSURE, ""]
     for target, limit in config.targets.items():
         texts = {(v.filter, v.case): v.text for v in every if v.target == target}
         names = dict.fromkeys(name for name, _ in texts)

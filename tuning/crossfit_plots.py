@@ -22,6 +22,7 @@ _DPI = 130
 _WIDTH = 0.72  # of a case's filters, where cases are 1 apart
 _TICKS = (0.1, 0.2, 0.3, 0.4, 0.5, 0.75, 1.0, 1.5, 2.0, 3.0, 5.0, 10.0)
 _GRAY = "#7d8590"
+_ALIKE = 5  # this color is too close to another one for dots
 
 
 def plot_crossfit(path: Path, config: CrossfitConfig, found: Crossfit, rows: Sequence[Row]) -> None:
@@ -59,14 +60,15 @@ def plot_crossfit(path: Path, config: CrossfitConfig, found: Crossfit, rows: Seq
         axes.yaxis.set_major_locator(FixedLocator(_TICKS))
         axes.yaxis.set_minor_locator(NullLocator())
         axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-        axes.plot([], [], "o", color=_GRAY, markerfacecolor="none", label="default")
+        if any(final[name] != "default" for name in names):
+            axes.plot([], [], "o", color=_GRAY, markerfacecolor="none", label="default")
         figure.legend(*axes.get_legend_handles_labels(), loc="outside right upper", fontsize=8)
         with output_file(path, overwrite=True) as temporary:
             figure.savefig(temporary, format="png", dpi=_DPI, facecolor="white")
 
 
 def _draw(axes: Axes, points: Sequence[tuple[float, Row]], index: int, label: str) -> None:
-    color = color_of(index)
+    color = _color(index)
     axes.plot(*_known(points), "o", color=color, markersize=5, label=label)
     for x, row in points:
         found = row.figures["flip_ratio"]
@@ -75,8 +77,12 @@ def _draw(axes: Axes, points: Sequence[tuple[float, Row]], index: int, label: st
 
 
 def _rings(axes: Axes, points: Sequence[tuple[float, Row]], index: int) -> None:
-    color = color_of(index)
+    color = _color(index)
     axes.plot(*_known(points), "o", color=color, markerfacecolor="none", markersize=5, alpha=0.8)
+
+
+def _color(index: int) -> str:
+    return color_of(index + (index >= _ALIKE))
 
 
 def _known(points: Sequence[tuple[float, Row]]) -> tuple[list[float], list[float]]:
