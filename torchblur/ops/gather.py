@@ -142,7 +142,7 @@ def read(
     y = torch.minimum(y.clamp(min=0), inputs["height"] - 1)
     if mode == "nearest":
         return _split(_at(texture, x.round(), y.round() + inputs["first_row"]))
-    if not torch.compiler.is_compiling() and texture.shape[1] <= _MOST_ROWS:
+    if not torch.compiler.is_dynamo_compiling() and texture.shape[1] <= _MOST_ROWS:
         return _sampled(texture, x, y + inputs["first_row"])
     left, top = x.detach().floor(), y.detach().floor()
     right = (left + 1).clamp(max=texture.shape[2] - 1)
@@ -177,7 +177,7 @@ def _at(texture: Tensor, column: Tensor, row: Tensor) -> Planes:
     """
     index = row.to(torch.int32) * texture.shape[2] + column.to(torch.int32)
     flat = texture.flatten(1)
-    if not torch.compiler.is_compiling():
+    if not torch.compiler.is_dynamo_compiling():
         return (flat.index_select(1, index.flatten()).reshape(texture.shape[0], *index.shape),)
     sets = index.shape[0]
     where = index.reshape(sets, -1).long()
