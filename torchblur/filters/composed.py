@@ -12,7 +12,9 @@ from torch import Tensor
 from torchblur.filters.base import BlurFilter, Values
 from torchblur.filters.composed_config import ComposedConfig
 from torchblur.filters.composed_gather import (
+    TAP_PARAMETERS,
     alternate_tap,
+    fill_hidden,
     pair_tap,
     shared_inputs,
     tap_options,
@@ -21,12 +23,19 @@ from torchblur.filters.composed_gather import (
 from torchblur.filters.guertin2014 import center_direction
 from torchblur.filters.notes2025_gather import Blurred, Line, Sums, compose
 from torchblur.filters.notes2025_postfilter import post_filter
-from torchblur.filters.reconstruction import Spread, resolve
+from torchblur.filters.reconstruction import (
+    Spread,
+    moving_tiles,
+    packed_values,
+    resolve,
+    texture_of,
+)
 from torchblur.filters.revealed import revealed_inputs
 from torchblur.frame import Frame, Shutter
 from torchblur.ops.directions import TileDirections, tile_directions
-from torchblur.ops.gather import Engine, Inputs, gather
+from torchblur.ops.gather import Engine, Inputs, gather_lists
 from torchblur.ops.noise import NoiseKind, noise_plane
+from torchblur.ops.pixels import PixelList
 from torchblur.ops.tiles import (
     neighbor_max,
     neighbor_min,
@@ -37,9 +46,18 @@ from torchblur.ops.tiles import (
 )
 from torchblur.ops.velocity import clamp_length, direction, half_velocity, length, quantize_uint8
 from torchblur.ops.weights import power, saturate
+from torchblur.params import declared
 
 __all__ = ["ComposedBlur", "ComposedConfig", "composed"]
 
+_SHARED_PARAMETERS = (
+    *TAP_PARAMETERS,
+    "relative_depth_extent",
+    "soft_depth_extent",
+    "kappa",
+    "center_taps",
+    "alpha_gain",
+)
 _SHORTEST_REACH = 1e-3  # px; what is shorter has no direction either
 _TRACE = 1e-6  # weight per tap
 _LEVEL = 1e-6  # neighbors whose depths differ by less, as a share, are one surface
@@ -99,6 +117,11 @@ class ComposedBlur(BlurFilter):
 
     name = "torchblur"
     config_class = ComposedConfig
+    per_frame = tuple(
+        name
+        for name, spec in declared(ComposedConfig).items()
+        if spec.grad != "discrete" and name not in _SHARED_PARAMETERS
+    )
 
     def compute(self, frame: Frame, values: Values) -> dict[str, Tensor]:
         """Return "color", the alphas, "weight" and the tiles."""
@@ -108,24 +131,41 @@ class ComposedBlur(BlurFilter):
 def _layers(frame: Frame, values: Values, engine: Engine) -> dict[str, Tensor]:
     seen = _clean_edges(frame, values)
     spread, tiles = _motion(seen, values)
-    offset = _tile_shift(frame.color, values)
-    first, second = (tile_lookup(t, frame.color, values.tile_size, offset) for t in tiles)
-    least = neighbor_min(tile_min(spread.length.detach(), values.tile_size))
-    least = tile_lookup(least, frame.color, values.tile_size, offset)
-    moving = length(first) > values.early_out
-    inputs = shared_inputs(seen, spread, values)
-    inputs["linear"] = (least >= values.bilinear_min).to(frame.dtype)
-    inputs["fast"] = (least >= values.fast_ratio * length(first)).to(frame.dtype)
-    inputs |= revealed_inputs(frame, values, lambda f, v: _layers(f, v, engine)["color"])
-    ways = _ways(first, second, spread, values)
-    lines = _lines(ways, inputs["linear"] > 0, moving, values)
-    sums = _gather(ways, lines, inputs, values, engine)
-    image = _resolve(frame, sums, spread, moving, values)
+    pixels = _moving_pixels(seen, tiles, values)
+    if pixels.count == 0:
+        none = torch.zeros_like(frame.color[:, :1])
+        planes = dict.fromkeys(("alpha", "output_alpha", "weight"), none)
+        return {"color": frame.color} | planes | tiles._asdict()
+    here, local = seen.only("depth", "valid").map(pixels.pack), packed_values(values, pixels)
+    first, second, least = _tile_planes(seen.color, spread.length, tiles, pixels, values)
+    inputs = shared_inputs(here, texture_of(seen, spread), pixels, local)
+    spread = Spread(*(pixels.pack(plane) for plane in spread))
+    inputs |= {"half": spread.half, "length": spread.length}
+    inputs["linear"] = (least >= local.bilinear_min).to(frame.dtype)
+    inputs["fast"] = (least >= local.fast_ratio * length(first)).to(frame.dtype)
+    inputs |= pixels.lists(
+        revealed_inputs(frame, values, lambda f, v: _layers(f, v, engine)["color"])
+    )
+    moving = length(first) > local.early_out
+    ways = _ways(first, second, spread, local)
+    lines = _lines(ways, inputs["linear"] > 0, moving, local)
+    sums = _gather(ways, lines, inputs, pixels, local, engine)
+    image = _unpacked(_resolve(here, sums, spread, moving, local), frame, pixels)
     if values.post_filter:
-        image = post_filter(frame, image, list(lines.values()), values, engine)
+        wide = [
+            line._replace(vector=pixels.unpack(line.vector), used=pixels.unpack(line.used))
+            for line in lines.values()
+        ]
+        image = post_filter(frame, image, wide, values, engine)
     layers = image._asdict() | tiles._asdict()
     del layers["influence"]
     return layers
+
+
+def _unpacked(image: Blurred, frame: Frame, pixels: PixelList) -> Blurred:
+    """Return images of the lists: all other pixels have their own color, and 0."""
+    color, *planes = image
+    return Blurred(pixels.unpack(color, over=frame.color), *(pixels.unpack(p) for p in planes))
 
 
 # -- motion ----------------------------------------------------------------------------------------
@@ -192,10 +232,32 @@ def _per_image(value: Tensor) -> Tensor:
     return value.mean((-2, -1), keepdim=True) if value.ndim == 4 else value
 
 
-def _tile_shift(color: Tensor, values: Values) -> Tensor:
+def _moving_pixels(frame: Frame, tiles: TileDirections, values: Values) -> PixelList:
+    """Return the pixels whose tiles move, or may look up one that does."""
+    wanted = moving_tiles(frame, values, tiles.primary)
+    if values.noise != "none" and bool((values.tile_jitter > 0).any()):
+        wanted = F.max_pool2d(wanted, 3, stride=1, padding=1)
+    return PixelList.in_tiles(wanted > 0, frame.color, values.tile_size)
+
+
+def _tile_planes(
+    color: Tensor, size: Tensor, tiles: TileDirections, pixels: PixelList, values: Values
+) -> list[Tensor]:
+    """Return both motions of the pixels' tiles, and the shortest half spread of the 3x3 tiles.
+
+    Args:
+        color: For its size, (B, 3, H, W).
+        size: Half spread of all pixels, px, (B, 1, H, W).
+        tiles: The motions.
+        pixels: Whose.
+        values: The parameters.
+    """
+    edge = values.tile_size
     kind: NoiseKind = "gradient" if values.noise == "checkerboard" else values.noise
-    noise = noise_plane(kind, color, 1, values.seed)
-    return tile_offset(color, noise, values.tile_size, values.tile_jitter)
+    noise = noise_plane(kind, color, 1, values.seed, pixels)
+    offset = tile_offset(color, noise, edge, pixels.pack(values.tile_jitter), pixels)
+    least = neighbor_min(tile_min(size.detach(), edge))
+    return [tile_lookup(t, color, edge, offset, pixels=pixels) for t in (*tiles, least)]
 
 
 # -- taps ------------------------------------------------------------------------------------------
@@ -264,7 +326,12 @@ def _lines(
 
 
 def _gather(
-    ways: dict[str, _Way], lines: dict[str, Line], shared: Inputs, values: Values, engine: Engine
+    ways: dict[str, _Way],
+    lines: dict[str, Line],
+    shared: Inputs,
+    pixels: PixelList,
+    values: Values,
+    engine: Engine,
 ) -> list[Sums]:
     """Return the means over the taps: of each line if in pairs, else of all together."""
     options = tap_options(values, tuple(ways))
@@ -273,7 +340,7 @@ def _gather(
         for name, line in lines.items():
             reach = ways[name].reach.clamp_min(_SHORTEST_REACH)
             inputs = shared | ways[name]._asdict() | {"reach": reach, "pairs": line.pairs}
-            totals = gather(pair_tap, options, line.most_pairs, inputs, engine)
+            totals = gather_lists(pair_tap, options, line.most_pairs, inputs, pixels, engine)
             area = values.area_slope * reach if values.accurate_alpha else None
             found.append(_means(totals, 2 * line.pairs, line, area, values))
         return found
@@ -284,7 +351,9 @@ def _gather(
     for name, one in ways.items():
         inputs |= {f"{name}_{key}": plane for key, plane in one._asdict().items()}
     tap = time_tap if values.sampling == "times" else alternate_tap
-    totals = gather(tap, options, values.num_samples, inputs, engine)
+    totals = gather_lists(tap, options, values.num_samples, inputs, pixels, engine)
+    if options.fill_hidden and values.sampling == "times":
+        totals = (*fill_hidden(totals[0], totals[1], values.background_gain), *totals[2:])
     spreads = values.accurate_alpha and values.sampling == "alternate"
     area = values.area_slope * way.reach if spreads else None
     return [_means(totals, count, line, area, values)]
@@ -294,12 +363,6 @@ def _means(
     totals: tuple[Tensor, ...], count: Tensor, line: Line, area: Tensor | None, values: Values
 ) -> Sums:
     *sums, alpha = (total / count for total in totals)
-    if sums[0].shape[1] > 3:
-        back, own_, seen, hid = sums[0].split((3, 3, 1, 1), 1)
-        known = seen > _TRACE
-        g = torch.where(known, hid / torch.where(known, seen, 1.0), 0.0)
-        sums[0] = values.background_gain * (back + g * own_)
-        sums[1] = values.background_gain * (sums[1] + torch.where(known, hid, 0.0))
     if area is not None:
         alpha = alpha * (1 + area)
     alpha = saturate(values.alpha_gain * alpha, values.softness)

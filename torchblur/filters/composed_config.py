@@ -61,6 +61,16 @@ class ComposedConfig(RevealedBackgroundConfig, ReconstructionConfig):
         low=0.0, high=1.0, grad="smooth", source=_OURS,
         meaning="times: the same, over the distance between sample and pixel",
     )] = 0.0
+    arrivals: Annotated[Literal["winner", "blend"], Param(
+        grad="discrete", source=_OURS,
+        meaning="times: color of the sample with the largest weight, or of all that arrive, at "
+                "one lookup each",
+    )] = "winner"
+    hidden_times: Annotated[Literal["fill", "drop"], Param(
+        grad="discrete", source=_OURS,
+        meaning="times at which nothing arrives and the pixel's own line lies behind something "
+                "nearer: filled with what passes the pixel at other times, or left out",
+    )] = "fill"
     edge_motion: Annotated[Literal["own", "nearest", "surface"], Param(
         grad="discrete", source=f"nearest: Karis 2014, temporal anti-aliasing; surface: {_OURS}",
         meaning="motion (surface: and depth) of a pixel beside a nearer one: its own, which is "

@@ -8,18 +8,29 @@ import torch
 from torch import Tensor
 
 from torchblur.filters.base import Values
-from torchblur.filters.reconstruction import ColorLookup, Spread, Tap, is_one, sample, texture_of
+from torchblur.filters.reconstruction import ColorLookup, Tap, is_one, sample
 from torchblur.frame import Frame, Shutter
 from torchblur.ops.cubic import second_differences
-from torchblur.ops.gather import Inputs, Planes, pixel_grid, read, weighted
+from torchblur.ops.gather import Inputs, Planes, read, weighted
 from torchblur.ops.noise import dither_2x2, noise_plane
+from torchblur.ops.pixels import PixelList
 from torchblur.ops.spread import Mirror, SpreadForm, TapPair, mirror, spread_weight
 from torchblur.ops.weights import DepthWeights, cone, cylinder, depth_weights, power, saturate
 
-__all__ = ["TapOptions", "alternate_tap", "pair_tap", "shared_inputs", "tap_options", "time_tap"]
+__all__ = [
+    "TAP_PARAMETERS",
+    "TapOptions",
+    "alternate_tap",
+    "fill_hidden",
+    "pair_tap",
+    "shared_inputs",
+    "tap_options",
+    "time_tap",
+]
 
 _TINY = 1e-6
-_PARAMETERS = (
+_TIE = 1e-4  # weights as close are equal: rounding must not decide
+TAP_PARAMETERS = (
     "cone_slope",
     "cone_exponent",
     "cylinder_inner",
@@ -36,6 +47,7 @@ _PARAMETERS = (
     "match_tolerance",
     "match_slope",
 )
+"""Parameters that the taps take as they are: sets of them share one frame."""
 
 Added = tuple[Planes, Tensor, Planes, Tensor, Tensor]
 """Color and weight of the back, color and weight of the front, and the front's alpha."""
@@ -48,6 +60,8 @@ class TapOptions(NamedTuple):
     """"first", "own", "second", "reversed": those that take part, in the order of their taps."""
     center: int
     refinements: int
+    one_color: bool
+    fill_hidden: bool
     relative_depth: bool
     shares: bool
     spread: Literal["cone", "ramp"]
@@ -76,6 +90,8 @@ def tap_options(values: Values, directions: tuple[str, ...]) -> TapOptions:
         directions=directions,
         center=Shutter(1, values.shutter_position).center,
         refinements=values.refinements,
+        one_color=values.arrivals == "winner",
+        fill_hidden=values.hidden_times == "fill",
         relative_depth=values.depth_compare == "relative",
         shares=values.depth_classes == "shares",
         spread=values.spread,
@@ -93,30 +109,45 @@ def tap_options(values: Values, directions: tuple[str, ...]) -> TapOptions:
     )
 
 
-def shared_inputs(frame: Frame, spread: Spread, values: Values) -> Inputs:
-    """Return the planes that the taps of all kinds look at."""
-    x, y = pixel_grid(frame.color)
+def shared_inputs(frame: Frame, texture: Tensor, pixels: PixelList, values: Values) -> Inputs:
+    """Return what the taps of all kinds look at, as lists of some pixels.
+
+    Args:
+        frame: Those pixels of the frame.
+        texture: From `texture_of`, all pixels.
+        pixels: The list.
+        values: The parameters, those per pixel as lists.
+    """
+    x, y = pixels.grid(frame.color)
     if values.noise == "checkerboard":
-        shift = dither_2x2(frame.color)
+        shift = dither_2x2(frame.color, pixels)
     else:
-        shift = noise_plane(values.noise, frame.color, 0, values.seed) - 0.5
+        shift = noise_plane(values.noise, frame.color, 0, values.seed, pixels) - 0.5
     relative = values.depth_compare == "relative"
     inputs = {
-        "texture": texture_of(frame, spread),
+        "texture": texture,
         "x": x,
         "y": y,
         "shift": shift * values.jitter,
         "depth": frame.finite_depth(),
-        "half": spread.half,
-        "length": spread.length,
         "extent": values.relative_depth_extent if relative else values.soft_depth_extent,
     }
     if values.color_lookup == "cubic":
-        inputs["texture_detail"] = second_differences(inputs["texture"][:, 4:])
-    return inputs | {key: getattr(values, key) for key in _PARAMETERS}
+        inputs["texture_detail"] = second_differences(texture[:, 4:])
+    return inputs | {key: getattr(values, key) for key in TAP_PARAMETERS}
 
 
 # -- a time at which all directions compete --------------------------------------------------------
+
+
+class _Arrival(NamedTuple):
+    """A sample that moves to the pixel."""
+
+    x: Tensor
+    y: Tensor
+    depth: Tensor
+    match: Tensor
+    """How well it does, in [0, 1]."""
 
 
 def time_tap(index: Tensor, count: Tensor, inputs: Inputs, options: TapOptions) -> Added:
@@ -129,54 +160,109 @@ def time_tap(index: Tensor, count: Tensor, inputs: Inputs, options: TapOptions) 
     found = [
         _follow(inputs[f"{name}_vector"], time, inputs, options) for name in options.directions
     ]
-    total: Tensor | None = None
-    colors: list[Planes] = []
-    open_share = torch.ones_like(found[0][1])
-    for tap, match in found:
-        weight = match
-        for other, its_match in found:
-            if other is not tap:
-                hidden = _classes(tap.depth, other.depth, inputs, options).foreground
-                weight = weight * (1 - its_match * hidden)
-        open_share = open_share * (1 - match)
-        seen = weight if tap.valid is None else weight * tap.valid
-        colors.append((*weighted(weight, tap.color), seen))
-        total = weight if total is None else total + weight
-    assert total is not None
+    weights = []
+    open_share = torch.ones_like(found[0].match)
+    for one in found:
+        weight = one.match
+        for other in found:
+            if other is not one:
+                hidden = _classes(one.depth, other.depth, inputs, options).foreground
+                weight = weight * (1 - other.match * hidden)
+        open_share = open_share * (1 - one.match)
+        weights.append(weight)
+    total = sum(weights[1:], weights[0])
     some = total > _TINY
     covered = torch.where(some, 1 - open_share, 0.0)
-    gain = inputs["foreground_gain"] * covered / torch.where(some, total, 1.0)
-    *front, seen = (gain * sum(planes[1:], planes[0]) for planes in zip(*colors, strict=True))
-    back, weight = _behind(time, 1 - covered, inputs, options)
-    return back, weight, tuple(front), seen, covered
+    colors = (_first_color if options.one_color else _mean_color)(found, weights, inputs, options)
+    share = inputs["foreground_gain"] * covered
+    *front, seen = (share * plane for plane in _added(*(color for _, color in colors)))
+    back, weight, hidden = _behind(time, 1 - covered, inputs, options)
+    if not options.fill_hidden:
+        return back, weight, tuple(front), seen, covered
+    near = covered * (1 - time.abs() / (1 + abs(options.center))).square()
+    visible = _added(*(weighted(near * is_visible, color) for is_visible, color in colors))
+    return (*back, *visible, hidden), weight, tuple(front), seen, covered
 
 
-def _follow(
-    vector: Tensor, time: Tensor, inputs: Inputs, options: TapOptions
-) -> tuple[Tap, Tensor]:
-    """Return the sample that moves to the pixel, and how well it does: its match in [0, 1]."""
+def fill_hidden(back: Tensor, weight: Tensor, gain: Tensor) -> tuple[Tensor, Tensor]:
+    """Return color and weight of the back, hidden times filled with the pixel's own surface.
+
+    Args:
+        back: What `time_tap` sums up for it, (P, 8, 1, M): color; color and weight of what passes
+            the pixel and is not in front of it; the share of hidden times.
+        weight: Weight of that color, (P, 1, 1, M).
+        gain: `background_gain`.
+    """
+    color, visible, seen, hidden = back.split((3, 3, 1, 1), 1)
+    known = seen > _TINY
+    hidden = torch.where(known, hidden, 0.0)
+    filled = hidden * visible / torch.where(known, seen, 1.0)
+    return gain * (color + filled), gain * (weight + hidden)
+
+
+def _follow(vector: Tensor, time: Tensor, inputs: Inputs, options: TapOptions) -> _Arrival:
+    """Return the sample that moves to the pixel from where this motion would bring it."""
     dx, dy = vector.split(1, 1)
     for _ in range(options.refinements):
         place = inputs["x"] - time * dx, inputs["y"] - time * dy
         ux, uy, size = read(inputs, *place, channels=slice(0, 3))
         dx, dy = ux * size, uy * size
-    tap = sample(inputs, inputs["x"] - time * dx, inputs["y"] - time * dy, options.color_lookup)
-    miss_x, miss_y = tap.unit_x * tap.length - dx, tap.unit_y * tap.length - dy
+    x, y = inputs["x"] - time * dx, inputs["y"] - time * dy
+    ux, uy, size, depth = read(inputs, x, y, channels=slice(0, 4))
+    miss_x, miss_y = ux * size - dx, uy * size - dy
     miss = (miss_x.square() + miss_y.square() + 1e-12).sqrt() * time.abs()
     far = (dx.square() + dy.square() + 1e-12).sqrt() * time.abs()
     allowed = inputs["match_tolerance"] + inputs["match_slope"] * far
-    return tap, saturate(1 - miss / allowed, options.softness)
+    return _Arrival(x, y, depth, saturate(1 - miss / allowed, options.softness))
+
+
+def _first_color(
+    found: list[_Arrival], weights: list[Tensor], inputs: Inputs, options: TapOptions
+) -> list[tuple[Tensor, Planes]]:
+    """Return the color of the sample with the largest weight: one lookup for all."""
+    x, y, most = found[0].x, found[0].y, weights[0]
+    for one, weight in zip(found[1:], weights[1:], strict=True):
+        larger = weight > most + _TIE
+        x, y = torch.where(larger, one.x, x), torch.where(larger, one.y, y)
+        most = torch.where(larger, weight, most)
+    tap = sample(inputs, x, y, options.color_lookup)
+    return [(_is_visible(tap, inputs, options), _colored(tap, torch.ones_like(most)))]
+
+
+def _mean_color(
+    found: list[_Arrival], weights: list[Tensor], inputs: Inputs, options: TapOptions
+) -> list[tuple[Tensor, Planes]]:
+    """Return the colors of all samples by weights that add up to 1."""
+    total = sum(weights[1:], weights[0])
+    total = torch.where(total > _TINY, total, 1.0)
+    colors = []
+    for one, weight in zip(found, weights, strict=True):
+        tap = sample(inputs, one.x, one.y, options.color_lookup)
+        colors.append((_is_visible(tap, inputs, options), _colored(tap, weight / total)))
+    return colors
+
+
+def _is_visible(tap: Tap, inputs: Inputs, options: TapOptions) -> Tensor:
+    """Return 1 unless the tap lies in front of the pixel, which may hide what it shows."""
+    behind = _classes(inputs["depth"], tap.depth, inputs, options).background
+    return (behind > 0).to(behind.dtype)
 
 
 def _behind(
     time: Tensor, share: Tensor, inputs: Inputs, options: TapOptions
-) -> tuple[Planes, Tensor]:
-    """Return color and weight of the tap on the pixel's own line, as far as it lies behind."""
+) -> tuple[Planes, Tensor, Tensor]:
+    """Return color and weight of the tap on the pixel's own line behind it, and what is hidden."""
     dx, dy = inputs["half"].split(1, 1)
     tap = sample(inputs, inputs["x"] - time * dx, inputs["y"] - time * dy, options.color_lookup)
-    classes = _classes(inputs["depth"], tap.depth, inputs, options)
-    weight = inputs["background_gain"] * share * classes.background
-    return weighted(weight, tap.color), weight if tap.valid is None else weight * tap.valid
+    behind = _classes(inputs["depth"], tap.depth, inputs, options).background
+    gain = 1.0 if options.fill_hidden else inputs["background_gain"]  # there it comes after
+    *color, weight = _colored(tap, gain * share * behind)
+    return tuple(color), weight, share * (1 - behind)
+
+
+def _colored(tap: Tap, weight: Tensor) -> Planes:
+    """Return a tap's color times a weight, and the weight of it that is valid."""
+    return *weighted(weight, tap.color), weight if tap.valid is None else weight * tap.valid
 
 
 # -- one direction by turns ------------------------------------------------------------------------
@@ -231,8 +317,8 @@ def pair_tap(index: Tensor, count: Tensor, inputs: Inputs, options: TapOptions) 
     )
 
 
-def _added(first: Planes, second: Planes) -> Planes:
-    return tuple(a + b for a, b in zip(first, second, strict=True))
+def _added(*parts: Planes) -> Planes:
+    return tuple(sum(planes[1:], planes[0]) for planes in zip(*parts, strict=True))
 
 
 # -- weights ---------------------------------------------------------------------------------------

@@ -33,6 +33,8 @@ __all__ = [
     "is_one",
     "longest_spread",
     "moving_part",
+    "moving_tiles",
+    "packed_values",
     "pixel_spread",
     "resolve",
     "revealed_part",
@@ -375,7 +377,7 @@ def moving_part(
     Returns:
         The part; None if nothing moves and no gradient may be wanted.
     """
-    tiles = _moving_tiles(frame, values, neighborhood)
+    tiles = moving_tiles(frame, values, neighborhood)
     wanted = tiles if stray is None else _dilated(tiles, 1)
     pixels = PixelList.in_tiles(wanted > 0, frame.color, values.tile_size)
     if pixels.count == 0:
@@ -391,7 +393,7 @@ def moving_part(
         pixels, dominant = pixels.some(chosen), select(dominant, chosen)
         shift = None if shift is None else select(shift, chosen)
     layers = frame.only("depth", "valid")
-    here, local = layers.map(pixels.pack), _packed(values, pixels)
+    here, local = layers.map(pixels.pack), packed_values(values, pixels)
     spread = pixel_spread(here, local, uint8=uint8)
     if pixels.index is None:
         texture = pixels.unpack(texture_of(here, spread))
@@ -399,12 +401,12 @@ def moving_part(
         far = -(-(values.tile_size + margin) // values.tile_size)
         reached = PixelList.in_tiles(_dilated(wanted, far) > 0, color, values.tile_size)
         there = layers.map(reached.pack)
-        read = pixel_spread(there, _packed(values, reached), uint8=uint8)
+        read = pixel_spread(there, packed_values(values, reached), uint8=uint8)
         texture = reached.unpack(texture_of(there, read))
     return Moving(pixels, here, local, dominant, shift, spread, texture)
 
 
-def _moving_tiles(frame: Frame, values: Values, neighborhood: Tensor) -> Tensor:
+def moving_tiles(frame: Frame, values: Values, neighborhood: Tensor) -> Tensor:
     """Return 1 for tiles that move, for any set of parameters, else 0, (B, 1, Ty, Tx)."""
     least = values.early_out
     if least.ndim == 4 and least.shape[0] > 1 and frame.batch_size == 1:
@@ -439,7 +441,8 @@ def _dilated(mask: Tensor, tiles: int) -> Tensor:
     return F.max_pool2d(mask, 2 * tiles + 1, stride=1, padding=tiles)
 
 
-def _packed(values: Values, pixels: PixelList) -> Values:
+def packed_values(values: Values, pixels: PixelList) -> Values:
+    """Return the parameters with those that are given per pixel as lists of some pixels."""
     packed = {
         key: pixels.pack(value) if isinstance(value, Tensor) else value
         for key, value in vars(values).items()
