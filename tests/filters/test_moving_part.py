@@ -35,9 +35,9 @@ def work_of(monkeypatch, blur, frame):
     counts = []
     original = gather_module.sum_taps
 
-    def counting(*args, num_pixels=None, **kwargs):
-        counts.append(num_pixels)
-        return original(*args, num_pixels=num_pixels, **kwargs)
+    def counting(*args, lists, **kwargs):
+        counts.append(lists.num_pixels)
+        return original(*args, lists=lists, **kwargs)
 
     monkeypatch.setattr(gather_module, "sum_taps", counting)
     with torch.no_grad():

@@ -244,7 +244,15 @@ def _filtered(frame: Frame, values: Values, engine: Engine) -> Filtered:
     inputs |= revealed_part(
         frame, values, part.pixels, lambda f, v: _filtered(f, v, engine).color(f)
     )
-    sums = gather_lists(_tap, _options(values), values.num_samples, inputs, part.pixels, engine)
+    sums = gather_lists(
+        _tap,
+        _options(values),
+        values.num_samples,
+        inputs,
+        part.pixels,
+        engine,
+        color_from=part.color_from,
+    )
     center_weight = values.num_samples / (part.values.kappa * inputs["length_p"])
     if not values.center_weight:
         center_weight = torch.zeros_like(center_weight)

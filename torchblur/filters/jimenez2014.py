@@ -279,7 +279,9 @@ def _sums(
             else plane
             for name, plane in inputs.items()
         }
-        sums = gather_lists(tap, options, pairs, some, pixels.some(chosen), engine)
+        sums = gather_lists(
+            tap, options, pairs, some, pixels.some(chosen), engine, color_from=part.color_from
+        )
         color, alpha = (
             whole + new.new_zeros(*new.shape[:3], pixels.count).index_copy(3, chosen, new)
             for whole, new in zip((color, alpha), sums, strict=True)

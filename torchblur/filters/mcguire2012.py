@@ -135,7 +135,9 @@ def _filtered(frame: Frame, values: Values, engine: Engine) -> Filtered:
         values.softness,
         values.color_lookup,
     )
-    sums = gather_lists(_tap, options, values.num_samples, inputs, part.pixels, engine)
+    sums = gather_lists(
+        _tap, options, values.num_samples, inputs, part.pixels, engine, color_from=part.color_from
+    )
     local = part.values
     center_weight = local.center_gain / torch.maximum(part.spread.length, local.min_length)
     moving = inputs["reach"] > local.early_out

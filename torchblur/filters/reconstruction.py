@@ -46,6 +46,7 @@ __all__ = [
 
 ColorLookup = Literal["nearest", "bilinear", "cubic", "opportunistic"]
 
+_COLOR = 4  # where a texture's color begins
 _ALMOST_ALL = 0.95  # from here on a choice costs more than it saves
 _WEIGHTS = "McGuire 2012, section 3.3 (restated by Tan 2022, appendix, eq. 5-10)"
 
@@ -349,6 +350,8 @@ class Moving(NamedTuple):
     spread: Spread
     texture: Tensor
     """What the taps look up, (B, 7 or 8, H, W); zero where none of them reaches."""
+    color_from: int
+    """First channel of the texture that may have a gradient: that of the color, or 0."""
 
     def grid(self) -> tuple[Tensor, Tensor]:
         """Return column and row of each pixel, (1, 1, 1, M) each."""
@@ -403,7 +406,9 @@ def moving_part(
         there = layers.map(reached.pack)
         read = pixel_spread(there, packed_values(values, reached), uint8=uint8)
         texture = reached.unpack(texture_of(there, read))
-    return Moving(pixels, here, local, dominant, shift, spread, texture)
+    motion = (frame.velocity, values.shutter, frame.finite_depth())
+    color_from = 0 if any(plane.requires_grad for plane in motion) else _COLOR
+    return Moving(pixels, here, local, dominant, shift, spread, texture, color_from)
 
 
 def moving_tiles(frame: Frame, values: Values, neighborhood: Tensor) -> Tensor:
@@ -511,9 +516,9 @@ def sample(inputs: Inputs, x: Tensor, y: Tensor, color_lookup: ColorLookup) -> T
     """
     ux, uy, size, depth, *near = read(inputs, x, y)
     if color_lookup == "cubic":
-        near = list(read_cubic(inputs, x, y, slice(4, None)))
+        near = list(read_cubic(inputs, x, y, slice(_COLOR, None)))
     elif color_lookup != "nearest":
-        fine = read(inputs, x, y, "bilinear", slice(4, None))
+        fine = read(inputs, x, y, "bilinear", slice(_COLOR, None))
         if color_lookup == "opportunistic":
             linear = inputs["linear"] > 0
             fine = tuple(torch.where(linear, f, n) for f, n in zip(fine, near, strict=True))

@@ -17,7 +17,8 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from torchblur.ops.pixels import PixelList, takes_all_pixels
-from torchblur.ops.taps import Engine, Inputs, Planes, TapFunction, sum_taps
+from torchblur.ops.tap_kernels import Lookups
+from torchblur.ops.taps import Engine, Inputs, Lists, Planes, TapFunction, sum_taps
 
 __all__ = [
     "Engine",
@@ -82,7 +83,7 @@ def gather(
     return tuple(pixels.unpack(total) for total in sums)
 
 
-def gather_lists(
+def gather_lists(  # noqa: PLR0913 - what `gather` takes, and the pixels
     tap: TapFunction,
     options: Hashable,
     num_samples: int,
@@ -91,6 +92,7 @@ def gather_lists(
     engine: Engine = "eager",
     *,
     num_maxima: int = 0,
+    color_from: int = 0,
 ) -> tuple[Tensor, ...]:
     """Return the same as `gather` from lists of pixels, as lists (P, C, 1, M).
 
@@ -103,14 +105,14 @@ def gather_lists(
         pixels: The pixels.
         engine: As in `gather`.
         num_maxima: Likewise.
+        color_from: Of the channels of "texture" before this one no gradient is wanted.
 
     Differentiable: as `gather`.
     """
     inputs = pixels.with_textures(lists)
     count = None if takes_all_pixels() else pixels.count  # parts would make a graph very long
-    return sum_taps(
-        tap, options, num_samples, inputs, engine, num_maxima=num_maxima, num_pixels=count
-    )
+    kind = Lists(count, color_from)
+    return sum_taps(tap, options, num_samples, inputs, engine, num_maxima=num_maxima, lists=kind)
 
 
 def read(
@@ -142,7 +144,8 @@ def read(
     y = torch.minimum(y.clamp(min=0), inputs["height"] - 1)
     if mode == "nearest":
         return _split(_at(texture, x.round(), y.round() + inputs["first_row"]))
-    if not torch.compiler.is_dynamo_compiling() and texture.shape[1] <= _MOST_ROWS:
+    compiling = torch.compiler.is_dynamo_compiling() or isinstance(texture, Lookups)
+    if not compiling and texture.shape[1] <= _MOST_ROWS:
         return _sampled(texture, x, y + inputs["first_row"])
     left, top = x.detach().floor(), y.detach().floor()
     right = (left + 1).clamp(max=texture.shape[2] - 1)
@@ -169,13 +172,15 @@ def _sampled(texture: Tensor, x: Tensor, y: Tensor) -> Planes:
     return values.reshape(texture.shape[0], *x.shape).unbind(0)
 
 
-def _at(texture: Tensor, column: Tensor, row: Tensor) -> Planes:
+def _at(texture: Tensor | Lookups, column: Tensor, row: Tensor) -> Planes:
     """Return values at whole pixels: one by one to the compiler, which joins them in one loop.
 
     Returns:
         One plane (P, 1, 1, M) per channel, or without a compiler all in one (C, P, 1, 1, M).
     """
     index = row.to(torch.int32) * texture.shape[2] + column.to(torch.int32)
+    if isinstance(texture, Lookups):
+        return texture.probed(_split(_at(texture.texture, column, row)), index)
     flat = texture.flatten(1)
     if not torch.compiler.is_dynamo_compiling():
         return (flat.index_select(1, index.flatten()).reshape(texture.shape[0], *index.shape),)

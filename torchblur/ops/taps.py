@@ -14,34 +14,44 @@ import itertools
 import math
 from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
 from torchblur.errors import ConfigError
-from torchblur.ops.compiling import (
-    compile_alone,
-    compiler_errors,
-    compiler_works,
-    give_up_compiling,
+from torchblur.ops.compiling import compiler_errors, compiler_works, give_up_compiling
+from torchblur.ops.tap_kernels import (
+    Engine,
+    Inputs,
+    Kernel,
+    Part,
+    Planes,
+    Reads,
+    TapFunction,
+    flat,
+    floating,
+    kernel_of,
+    reads_of,
 )
 
-__all__ = ["Added", "Engine", "Inputs", "Planes", "TapFunction", "sum_taps"]
-
-Engine = Literal["eager", "compiled"]
-Inputs = dict[str, Tensor]
-Planes = tuple[Tensor, ...]
-Added = tuple[Tensor | Planes, ...]
-"""What a tap adds to each accumulator: a tensor, or planes that belong together."""
-TapFunction = Callable[[Tensor, Tensor, Inputs, Any], Added]
-"""``tap(index, count, inputs, options)``: index and count are 0-d float tensors."""
+__all__ = ["Engine", "Inputs", "Lists", "Planes", "TapFunction", "sum_taps"]
 
 _PART = 1 << 16  # pixels; the planes of so many fill a CPU's cache of the second level
 _LEAST_PART = 1 << 10  # pixels; with fewer, calls cost more than what they do
 _TAPS_PER_CALL = {"cpu": 1, "cuda": 4}
 """Taps that one kernel adds: on a GPU each pass over the planes serves several. More of them take
 longer to compile."""
+
+
+class Lists(NamedTuple):
+    """Which inputs of a sum are lists of pixels, and what is wanted of its textures."""
+
+    num_pixels: int | None
+    """Inputs (P, C, 1, M) with this M are lists. Taps take each pixel on its own, so that they can
+    be worked on in parts, and read textures by `ops.gather.read` alone. None: no lists."""
+    color_from: int = 0
+    """Of the channels of "texture" before this one no gradient is wanted."""
 
 
 def sum_taps(
@@ -52,7 +62,7 @@ def sum_taps(
     engine: Engine = "eager",
     *,
     num_maxima: int = 0,
-    num_pixels: int | None = None,
+    lists: Lists | None = None,
 ) -> Planes:
     """Return the sums over ``num_samples`` taps of what the tap function returns.
 
@@ -65,8 +75,7 @@ def sum_taps(
         engine: "eager", or "compiled" to compile the tap function with `torch.compile`; without
             a compiler there is one warning and the eager result.
         num_maxima: So many accumulators, the last ones, are maxima over the taps, not sums.
-        num_pixels: Inputs (P, C, 1, `num_pixels`) are lists of pixels, which the tap takes each on
-            its own, so that they can be worked on in parts. None: there are no lists.
+        lists: Which inputs are lists of pixels; None: there are none.
 
     Returns:
         The accumulators; where the tap returns a tuple of planes, they are joined along
@@ -88,9 +97,9 @@ def sum_taps(
     if any(0 in shape for shape in form.shapes) or not (engine == "eager" or compiler_works()):
         engine = "eager"
     for candidate in ("compiled", "eager") if engine == "compiled" else ("eager",):
-        kernel = _kernel(tap, options, candidate, form.num_summed)
+        kernel = kernel_of(tap, options, candidate, form.num_summed)
         try:
-            return form.joined(_run(_Sum(kernel, num_samples, form, num_pixels), given))
+            return form.joined(_run(_Sum(kernel, num_samples, form, lists or Lists(None)), given))
         except compiler_errors() as error:
             if candidate == "eager":
                 raise
@@ -128,13 +137,6 @@ class _Form:
         )
 
 
-def _flat(added: Added) -> Planes:
-    planes: list[Tensor] = []
-    for part in added:
-        planes += part if isinstance(part, tuple) else (part,)
-    return tuple(planes)
-
-
 @functools.lru_cache(maxsize=256)
 def _form_of(
     tap: TapFunction,
@@ -146,48 +148,35 @@ def _form_of(
     inputs = {
         name: torch.empty(shape, dtype=dtype, device="meta") for name, shape, dtype in signature
     }
-    index = torch.empty((), dtype=_floating(inputs).dtype, device="meta")
+    index = torch.empty((), dtype=floating(inputs).dtype, device="meta")
     added = tap(index, index, inputs, options)
     widths = tuple(len(part) if isinstance(part, tuple) else 0 for part in added)
     summed = sum(max(width, 1) for width in widths[: len(widths) - num_maxima])
-    return _Form(tuple(plane.shape for plane in _flat(added)), widths, summed)
-
-
-def _floating(inputs: Inputs) -> Tensor:
-    """Return the first floating tensor: its type and device are those of the sums."""
-    return next(t for t in inputs.values() if t.is_floating_point())
-
-
-@dataclass(frozen=True)
-class _Kernel:
-    """Some taps, forward and backward, eager or compiled."""
-
-    add: Callable[[Planes, Planes, Tensor, Inputs], Planes]
-    pull: Callable[..., tuple[Inputs, Planes]]
+    return _Form(tuple(plane.shape for plane in flat(added)), widths, summed)
 
 
 @dataclass(frozen=True, eq=False)
 class _Sum:
     """One sum over taps: what is added, how often, and over how many pixels."""
 
-    kernel: _Kernel
+    kernel: Kernel
     num_samples: int
     form: _Form
-    num_pixels: int | None
+    lists: Lists
 
     def is_list(self, tensor: Tensor) -> bool:
         """Whether a tensor is a list of pixels, of which a part can be taken."""
-        return tensor.ndim == 4 and tensor.shape[-1] == self.num_pixels
+        return tensor.ndim == 4 and tensor.shape[-1] == self.lists.num_pixels
 
     def parts(self, like: Tensor) -> list[slice | None]:
         """Return parts of about equal size; [None] for all pixels at once."""
-        if self.num_pixels is None or like.device.type != "cpu":
+        if self.lists.num_pixels is None or like.device.type != "cpu":
             return [None]
         sets = max(shape[0] for shape in self.form.shapes)
-        count = min(-(-self.num_pixels * sets // _PART), self.num_pixels // _LEAST_PART)
+        count = min(-(-self.lists.num_pixels * sets // _PART), self.lists.num_pixels // _LEAST_PART)
         if count <= 1:
             return [None]
-        ends = [self.num_pixels * i // count for i in range(count + 1)]
+        ends = [self.lists.num_pixels * i // count for i in range(count + 1)]
         return [slice(start, stop) for start, stop in itertools.pairwise(ends)]
 
     def part(self, tensor: Tensor, part: slice | None) -> Tensor:
@@ -227,11 +216,15 @@ class _SumTaps(torch.autograd.Function):
         named = dict(zip(ctx.names, tensors[: len(needed)], strict=True))
         wanted = [name for name, needs in zip(ctx.names, needed, strict=True) if needs]
         totals = {name: torch.zeros_like(named[name]) for name in wanted}
-        # Any pixel of a texture may be read by any part: its gradient is summed over all at once.
-        whole = any(named[name].ndim == 3 for name in wanted)
-        for part in [None] if whole else job.parts(_floating(named)):
+        textures = [name for name in wanted if job.lists.num_pixels and named[name].ndim == 3]
+        in_place = job.kernel.engine == "compiled"
+        # Any pixel of a texture may be read by any part: its gradient is one sum over all of them.
+        whole = bool(textures) and not in_place
+        scattered = {name: totals[name].flatten() for name in textures if in_place}
+        for part in [None] if whole else job.parts(floating(named)):
             cut = [job.part(tensor, part) for tensor in (*tensors, *grads)]
-            pulled = _pull(job, dict(zip(ctx.names, cut, strict=False)), wanted, cut[len(needed) :])
+            pieces = dict(zip(ctx.names, cut, strict=False))
+            pulled = _pull(job, pieces, wanted, scattered, cut[len(needed) :])
             for name, piece in pulled.items():
                 if part is not None and not job.is_list(totals[name]):
                     piece = totals[name] + piece
@@ -242,34 +235,43 @@ class _SumTaps(torch.autograd.Function):
 _apply: Callable[..., Planes] = _SumTaps.apply
 
 
-def _pull(job: _Sum, named: Inputs, wanted: Sequence[str], rest: Sequence[Tensor]) -> Inputs:
+def _pull(
+    job: _Sum, named: Inputs, wanted: Sequence[str], scattered: Inputs, rest: Sequence[Tensor]
+) -> Inputs:
     """Return the gradients of the wanted inputs, of one part of the pixels.
 
     Args:
         job: The sum.
         named: All inputs.
         wanted: Names of those whose gradient is wanted.
+        scattered: Gradients of textures, flat, which are added to in place and not returned.
         rest: The maxima, then the gradients of all accumulators.
     """
     num_maxima = len(job.form.shapes) - job.form.num_summed
     peaks = tuple(rest[:num_maxima])
     # Views of other tensors would be another case to the compiler for each shape of those.
     grads = tuple(g.clone(memory_format=torch.contiguous_format) for g in rest[num_maxima:])
-    leaves = {name: named[name] for name in wanted}
+    leaves = {name: named[name] for name in wanted if name not in scattered}
     others = {name: tensor for name, tensor in named.items() if name not in leaves}
+    part = Part(leaves, others, grads, peaks, scattered)
+    reads: Reads = ()
+    if scattered:
+        signature = tuple((name, t.shape, t.dtype) for name, t in named.items())
+        kernel, names = job.kernel, tuple(scattered)
+        reads = reads_of(kernel.tap, kernel.options, signature, names, job.lists.color_from)
     totals = {name: torch.zeros_like(tensor) for name, tensor in leaves.items()}
     taken = tuple(torch.zeros_like(peak, dtype=torch.bool) for peak in peaks)
-    groups, number = _groups(job.num_samples, _floating(named))
+    groups, number = _groups(job.num_samples, floating(named))
     for indices in groups:
         totals, taken = job.kernel.pull(
-            totals, taken, indices, number, leaves, others, grads, peaks
+            totals, taken, indices, number, part, reads, job.lists.color_from
         )
     return totals
 
 
 @torch.no_grad()
 def _sum(job: _Sum, inputs: Inputs) -> Planes:
-    like = _floating(inputs)
+    like = floating(inputs)
     inputs = {name: tensor.detach() for name, tensor in inputs.items()}
     groups, number = _groups(job.num_samples, like)
     whole = job.form.start(like)
@@ -292,59 +294,3 @@ def _groups(num_samples: int, like: Tensor) -> tuple[list[Planes], Tensor]:
     full = num_samples - num_samples % size
     groups = [indices[i : i + size] for i in range(0, full, size)]
     return groups + [(index,) for index in indices[full:]], numbers[-1]
-
-
-@functools.lru_cache(maxsize=128)
-def _kernel(tap: TapFunction, options: Hashable, engine: Engine, num_summed: int) -> _Kernel:
-    """Return the functions of some taps; one object for each structure."""
-
-    def add(sums: Planes, indices: Planes, count: Tensor, inputs: Inputs) -> Planes:
-        for index in indices:
-            pairs = tuple(zip(sums, _flat(tap(index, count, inputs, options)), strict=True))
-            total = tuple(s + a for s, a in pairs[:num_summed])
-            sums = total + tuple(torch.maximum(s, a) for s, a in pairs[num_summed:])
-        return sums
-
-    def pull(  # noqa: PLR0913 - a closed function: all it touches is passed
-        totals: Inputs,
-        taken: Planes,
-        indices: Planes,
-        count: Tensor,
-        wanted: Inputs,
-        others: Inputs,
-        grads: Planes,
-        peaks: Planes,
-    ) -> tuple[Inputs, Planes]:
-        for index in indices:
-            totals, taken = pull_one(totals, taken, index, count, wanted, others, grads, peaks)
-        return totals, taken
-
-    def pull_one(  # noqa: PLR0913
-        totals: Inputs,
-        taken: Planes,
-        index: Tensor,
-        count: Tensor,
-        wanted: Inputs,
-        others: Inputs,
-        grads: Planes,
-        peaks: Planes,
-    ) -> tuple[Inputs, Planes]:
-        def one_tap(leaves: Inputs) -> Planes:
-            added = _flat(tap(index, count, others | leaves, options))
-            return tuple(a.expand_as(g) for a, g in zip(added, grads, strict=True))
-
-        values, vjp, *_ = torch.func.vjp(one_tap, wanted)
-        first = []
-        for value, peak, before in zip(values[num_summed:], peaks, taken, strict=True):
-            # Recomputed by another graph, a value may differ in its last bits.
-            first.append((value >= peak - 1e-6 * peak.abs()) & ~before)
-        due = grads[:num_summed] + tuple(
-            g * f for g, f in zip(grads[num_summed:], first, strict=True)
-        )
-        (parts,) = vjp(due)
-        taken = tuple(t | f for t, f in zip(taken, first, strict=True))
-        return {name: totals[name] + parts[name] for name in totals}, taken
-
-    if engine == "compiled":
-        return _Kernel(compile_alone(add, dynamic=True), compile_alone(pull, dynamic=True))
-    return _Kernel(add, pull)

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 from torch._dynamo.utils import counters
 
-from torchblur.ops import taps
+from torchblur.ops import tap_kernels, taps
 from torchblur.ops.compiling import compile_alone
 
 __all__ = ["traced_kernels"]
@@ -24,9 +24,9 @@ def traced_kernels(monkeypatch: pytest.MonkeyPatch) -> Callable[[], int]:
     def trace(function: Callable[..., Any], **options: Any) -> Callable[..., Any]:
         return compile_alone(function, **(options | {"backend": "eager"}))
 
-    monkeypatch.setattr(taps, "compile_alone", trace)
+    monkeypatch.setattr(tap_kernels, "compile_alone", trace)
     monkeypatch.setattr(taps, "compiler_works", lambda: True)
-    fresh = taps._kernel.__wrapped__
+    fresh = tap_kernels.kernel_of.__wrapped__
     kernels: dict[Any, Any] = {}
 
     def kernel(*key: Any) -> Any:
@@ -34,6 +34,6 @@ def traced_kernels(monkeypatch: pytest.MonkeyPatch) -> Callable[[], int]:
             kernels[key] = fresh(*key)
         return kernels[key]
 
-    monkeypatch.setattr(taps, "_kernel", kernel)
+    monkeypatch.setattr(taps, "kernel_of", kernel)
     before: int = counters["stats"]["unique_graphs"]
     return lambda: int(counters["stats"]["unique_graphs"]) - before
