@@ -122,9 +122,9 @@ class TestWithoutACompiler:
             assert not compiling.compiler_works()
 
 
-def test_functions_of_one_line_are_counted_apart(monkeypatch):
+@torch._dynamo.config.patch(recompile_limit=2)
+def test_functions_of_one_line_are_counted_apart():
     """Torch compiles no code object more often than this limit."""
-    monkeypatch.setattr(torch._dynamo.config, "recompile_limit", 2)
 
     def make(number):
         return lambda x: x * number

@@ -30,7 +30,8 @@ class TestOnTheCpu:
         assert limits["guertin2014, 1920x1080, N = 35, everything moves"] == 2.2
         assert limits["10 % of the area moves, over all of it"] == 0.2
         assert limits["nothing moves, over all of it"] == 0.03
-        assert limits["forward and backward, over forward"] == 4
+        assert limits["forward and backward of a fit (all parameters), over forward"] == 4
+        assert limits["the same, with the gradient of the color"] == 4
         assert limits["forward and backward, over forward: peak memory"] == 3
         assert limits["32 parameter sets of one 128x128 frame: 32 calls over one"] == 3
 
@@ -39,6 +40,7 @@ class TestOnTheCpu:
         rows = with_figures(rows, GUERTIN.but(moving=10), cpu_s=0.3)
         rows = with_figures(rows, GUERTIN.but(moving=0), cpu_s=0.1)
         rows = with_figures(rows, GUERTIN.but(what="backward"), cpu_s=9.0, peak_mib=250.0)
+        rows = with_figures(rows, GUERTIN.but(what="parameters"), cpu_s=7.0)
         sets = GUERTIN.but(width=128, height=128, sets=32)
         rows = with_figures(rows, sets, cpu_s=0.5)
         found = by_name(judge_targets(targets_for("cpu"), rows))
@@ -50,7 +52,8 @@ class TestOnTheCpu:
             "guertin2014, 1280x720, N = 35, eager": (2.0, True),
             "10 % of the area moves, over all of it": (0.15, True),
             "nothing moves, over all of it": (0.05, False),
-            "forward and backward, over forward": (4.5, False),
+            "forward and backward of a fit (all parameters), over forward": (3.5, True),
+            "the same, with the gradient of the color": (4.5, False),
             "forward and backward, over forward: peak memory": (2.5, True),
             "backward, 1280x720, N = 35 over N = 5: peak memory": (1.0, True),
             "32 parameter sets of one 128x128 frame: 32 calls over one": (4.0, True),

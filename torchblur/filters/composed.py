@@ -46,18 +46,8 @@ from torchblur.ops.tiles import (
 )
 from torchblur.ops.velocity import clamp_length, direction, half_velocity, length, quantize_uint8
 from torchblur.ops.weights import power, saturate
-from torchblur.params import declared
 
 __all__ = ["ComposedBlur", "ComposedConfig", "composed"]
-
-_SHARED_PARAMETERS = (
-    *TAP_PARAMETERS,
-    "relative_depth_extent",
-    "soft_depth_extent",
-    "kappa",
-    "center_taps",
-    "alpha_gain",
-)
 _SHORTEST_REACH = 1e-3  # px; what is shorter has no direction either
 _TRACE = 1e-6  # weight per tap
 _LEVEL = 1e-6  # neighbors whose depths differ by less, as a share, are one surface
@@ -117,11 +107,16 @@ class ComposedBlur(BlurFilter):
 
     name = "torchblur"
     config_class = ComposedConfig
-    per_frame = tuple(
-        name
-        for name, spec in declared(ComposedConfig).items()
-        if spec.grad != "discrete" and name not in _SHARED_PARAMETERS
-    )
+
+    def engine_for(self, pixels: float) -> Engine:
+        """Return the engine that suits an amount of work: "auto" is the eager one.
+
+        The backward of taps that are times takes minutes to compile.
+
+        Args:
+            pixels: Of all calls together.
+        """
+        return self.engine
 
     def compute(self, frame: Frame, values: Values) -> dict[str, Tensor]:
         """Return "color", the alphas, "weight" and the tiles."""

@@ -51,7 +51,7 @@ class FilterContract:
     inert: ClassVar[tuple[str, ...]] = ()
     """Parameters of all filters that change nothing in this one."""
     one_structure: ClassVar[dict[str, Any]] = {}
-    """Switches with which the frame's content does not decide which kernels there are."""
+    """For compiled taps: switches that make one kernel, whatever the frame, or a small one."""
     box_tolerance: ClassVar[float] = 0.02
     """Largest mean difference to a box blur under uniform motion, color in [0, 1]."""
 
@@ -358,7 +358,8 @@ class FilterContract:
             frame = self.given(moving_square())
             color = frame.color.clone().requires_grad_()
             frame = dataclasses.replace(frame, color=color)
-            blur = self.filter_class(None, engine=engine, **self.few_taps())
+            params = self.few_taps() | self.one_structure
+            blur = self.filter_class(None, engine=engine, **params)
             image = self.image(blur, frame)
             image.square().mean().backward()
             used = [p.grad for p in blur.parameters() if p.grad is not None]
