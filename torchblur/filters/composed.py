@@ -12,7 +12,6 @@ from torch import Tensor
 from torchblur.filters.base import BlurFilter, Values
 from torchblur.filters.composed_config import ComposedConfig
 from torchblur.filters.composed_gather import (
-    TAP_PARAMETERS,
     alternate_tap,
     fill_hidden,
     pair_tap,
