@@ -12,7 +12,7 @@ FILTERS = ("guertin2014", "jimenez2014", "line", "mcguire2012", "notes2025", "so
 
 
 def partly_moving(batch_size=1, seed=0):
-    frame = random_frame(48, 220, batch_size=batch_size, speed=9.0, seed=seed)
+    frame = random_frame(48, 220, batch_size=batch_size, speed=60.0, seed=seed)
     velocity = frame.velocity.clone()
     velocity[:, :, :12] = 0
     velocity[..., 30:] = 0
