@@ -64,8 +64,9 @@ def composed(frame: Frame, config: ComposedConfig | None = None, **params: Any) 
     ``w_k = m_k Π_j (1 − m_j f_kj)``,  ``f_kj = 1 − sat(level + (Z_j − Z_k) / extent)``.
 
     The front's share of this time is ``c = 1 − Π (1 − m_k)``, its color ``Σ w_k C_k / Σ w_k``, or
-    with `arrivals` "winner" the color of the greatest w_k, which takes one lookup. Where nothing arrives, a surface has left the pixel and lets the back through: the tap on the
-    pixel's own line, as far as it lies behind. With ``α = Σ c / N`` the result is
+    with `arrivals` "winner" the color of the greatest w_k, which takes one lookup. Where nothing
+    arrives, a surface has left the pixel and lets the back through: the tap on the pixel's own
+    line, as far as it lies behind. With ``α = Σ c / N`` the result is
     ``α front + (1 − α) back``, each normalized; without a back it is the front alone. Times at
     which something nearer hides that line are filled with what passes the pixel and is not in
     front of it (`hidden_times`).
