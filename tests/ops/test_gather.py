@@ -70,6 +70,20 @@ def test_lists_of_pixels_give_what_images_give(mode, batch_size, sets, share):
         assert torch.allclose(ours, theirs, atol=1e-10)
 
 
+@pytest.mark.parametrize("strided", [False, True])
+def test_compiled_gradient_of_a_texture_in_any_layout(strided):
+    grads = []
+    for engine in ("eager", "compiled"):
+        inputs = make_inputs(dtype=torch.float32)
+        leaf = inputs["texture"].clone().requires_grad_()
+        given = leaf.transpose(2, 3).contiguous().transpose(2, 3) if strided else leaf
+        color, _ = gather(tap, "nearest", 3, inputs | {"texture": given}, engine)
+        color.square().sum().backward()
+        grads.append(leaf.grad)
+    assert grads[0].any()
+    assert torch.allclose(*grads, rtol=1e-4, atol=1e-5)
+
+
 def test_many_rows_are_interpolated_from_their_corners(monkeypatch):
     inputs = make_inputs(3)
     whole = gather(tap, "bilinear", 6, inputs)

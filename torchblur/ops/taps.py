@@ -215,12 +215,13 @@ class _SumTaps(torch.autograd.Function):
         tensors = [tensor.detach() for tensor in ctx.saved_tensors]
         named = dict(zip(ctx.names, tensors[: len(needed)], strict=True))
         wanted = [name for name, needs in zip(ctx.names, needed, strict=True) if needs]
-        totals = {name: torch.zeros_like(named[name]) for name in wanted}
+        # Contiguous, whatever the input is: what is scattered goes into a flat view of them.
+        totals = {name: named[name].new_zeros(named[name].shape) for name in wanted}
         textures = [name for name in wanted if job.lists.num_pixels and named[name].ndim == 3]
         in_place = job.kernel.engine == "compiled"
         # Any pixel of a texture may be read by any part: its gradient is one sum over all of them.
         whole = bool(textures) and not in_place
-        scattered = {name: totals[name].flatten() for name in textures if in_place}
+        scattered = {name: totals[name].view(-1) for name in textures if in_place}
         for part in [None] if whole else job.parts(floating(named)):
             cut = [job.part(tensor, part) for tensor in (*tensors, *grads)]
             pieces = dict(zip(ctx.names, cut, strict=False))
