@@ -75,10 +75,10 @@ def worth_compiling(work: float, device: torch.device | str = "cpu") -> bool:
 def kernel_folder() -> Path:
     """Return where compiled kernels are kept.
 
-    TORCHINDUCTOR_CACHE_DIR if it is set (torch sets it as soon as anything is compiled), else
-    `kernels` in `cache_folder`.
+    TORCHINDUCTOR_CACHE_DIR if it is set (not by torch itself, which sets it to a temporary folder
+    as soon as its compiler is loaded), else `kernels` in `cache_folder`.
     """
-    own = os.environ.get(_CACHE_VARIABLE)
+    own = _chosen_folder()
     return Path(own) if own else cache_folder() / "kernels"
 
 
@@ -152,9 +152,18 @@ def compile_alone(function: Callable[..., Any], **options: Any) -> Callable[...,
     return torch.compile(own, **options)
 
 
+def _chosen_folder() -> str | None:
+    """Return the folder for kernels that the user has chosen, if so."""
+    own = os.environ.get(_CACHE_VARIABLE)
+    if not own:
+        return None
+    torchs = importlib.import_module("torch._inductor.runtime.cache_dir_utils").default_cache_dir()
+    return None if own == torchs else own
+
+
 def _keep_kernels() -> None:
     """Tell torch where kernels are kept, if the user did not; its default is a temporary folder."""
-    if os.environ.get(_CACHE_VARIABLE):
+    if _chosen_folder():
         return
     folder = kernel_folder()
     try:
