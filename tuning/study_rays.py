@@ -13,7 +13,7 @@ from torch import Tensor
 
 from torchblur.filters import BlurFilter, get_filter
 from torchblur.filters.base import Values
-from torchblur.filters.reconstruction import spread_of
+from torchblur.filters.spreads import spread_of
 from torchblur.frame import Frame, Shutter
 from torchblur.ops.raymask import edge_strength, ray_mask, uncovered
 from torchblur.render import render_revealed

@@ -20,16 +20,12 @@ from torchblur.filters.composed_gather import (
     time_tap,
 )
 from torchblur.filters.guertin2014 import center_direction
+from torchblur.filters.moving import moving_tiles, packed_values
 from torchblur.filters.notes2025_gather import Blurred, Line, Sums, compose
 from torchblur.filters.notes2025_postfilter import post_filter
-from torchblur.filters.reconstruction import (
-    Spread,
-    moving_tiles,
-    packed_values,
-    resolve,
-    texture_of,
-)
+from torchblur.filters.reconstruction import resolve, texture_of
 from torchblur.filters.revealed import revealed_inputs
+from torchblur.filters.spreads import Spread
 from torchblur.frame import Frame, Shutter
 from torchblur.ops.directions import TileDirections, tile_directions
 from torchblur.ops.gather import Engine, Inputs, gather_lists

@@ -8,22 +8,17 @@ import torch
 from torch import Tensor
 
 from torchblur.filters.base import BlurFilter, Values
+from torchblur.filters.moving import Filtered, Moving, Stray, moving_part, revealed_part
 from torchblur.filters.reconstruction import (
     WEIGHT_PARAMETERS,
-    Filtered,
-    Moving,
     ReconstructionConfig,
-    Spread,
-    Stray,
     Tap,
     is_one,
-    moving_part,
     resolve,
-    revealed_part,
     sample,
-    tiles_of,
 )
 from torchblur.filters.revealed import RevealedBackgroundConfig
+from torchblur.filters.spreads import Spread, tiles_of
 from torchblur.frame import Frame, Shutter
 from torchblur.ops.color import luma
 from torchblur.ops.gather import Engine, Inputs, Lookup, Planes, gather_lists, weighted

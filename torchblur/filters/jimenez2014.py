@@ -8,18 +8,10 @@ import torch
 from torch import Tensor
 
 from torchblur.filters.base import BlurFilter, Values
-from torchblur.filters.reconstruction import (
-    Filtered,
-    Moving,
-    Stray,
-    Tap,
-    moving_part,
-    pixel_spread,
-    revealed_part,
-    sample,
-    tiles_of,
-)
+from torchblur.filters.moving import Filtered, Moving, Stray, moving_part, revealed_part
+from torchblur.filters.reconstruction import Tap, sample
 from torchblur.filters.revealed import RevealedBackgroundConfig
+from torchblur.filters.spreads import pixel_spread, tiles_of
 from torchblur.frame import Frame, Shutter
 from torchblur.ops.gather import Engine, Inputs, Lookup, Planes, gather_lists, weighted
 from torchblur.ops.noise import NoiseKind, dither_2x2, noise_plane

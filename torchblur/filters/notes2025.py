@@ -20,8 +20,8 @@ from torchblur.filters.notes2025_gather import (
     shared_inputs,
 )
 from torchblur.filters.notes2025_postfilter import post_filter
-from torchblur.filters.reconstruction import Spread
 from torchblur.filters.revealed import layer_behind, revealed_inputs
+from torchblur.filters.spreads import Spread
 from torchblur.frame import Frame, Shutter
 from torchblur.ops.directions import TileDirections, tile_directions
 from torchblur.ops.gather import Engine

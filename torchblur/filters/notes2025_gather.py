@@ -8,7 +8,8 @@ import torch
 from torch import Tensor
 
 from torchblur.filters.base import Values
-from torchblur.filters.reconstruction import ColorLookup, Spread, Tap, sample, texture_of
+from torchblur.filters.reconstruction import ColorLookup, Tap, sample, texture_of
+from torchblur.filters.spreads import Spread
 from torchblur.frame import Frame, Shutter
 from torchblur.ops.gather import Engine, Inputs, Planes, gather, pixel_grid, weighted
 from torchblur.ops.noise import dither_2x2, noise_plane

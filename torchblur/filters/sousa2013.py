@@ -11,14 +11,12 @@ from torchblur.filters.base import BlurFilter, Values
 from torchblur.filters.reconstruction import (
     WEIGHT_PARAMETERS,
     ReconstructionConfig,
-    Spread,
-    Tiles,
     is_one,
     resolve,
     sample,
-    spread_of,
     texture_of,
 )
+from torchblur.filters.spreads import Spread, Tiles, spread_of
 from torchblur.frame import Frame, Shutter
 from torchblur.ops.gather import Engine, Inputs, Lookup, Planes, gather, pixel_grid, weighted
 from torchblur.ops.noise import NoiseKind, noise_plane

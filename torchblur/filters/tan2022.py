@@ -11,16 +11,14 @@ from torch import Tensor
 from torchblur.filters.base import BlurFilter, Values
 from torchblur.filters.reconstruction import (
     WEIGHT_PARAMETERS,
-    Spread,
     Tap,
-    Tiles,
     is_one,
     resolve,
     sample,
-    spread_of,
     texture_of,
 )
 from torchblur.filters.revealed import behind_slope, layer_behind, share_behind
+from torchblur.filters.spreads import Spread, Tiles, spread_of
 from torchblur.filters.tan2022_config import Tan2022Config
 from torchblur.frame import Frame, Shutter
 from torchblur.ops.gather import Engine, Inputs, Lookup, Planes, gather, pixel_grid, weighted

@@ -75,7 +75,7 @@ def test_what_moves_alone_gives_what_all_pixels_give(monkeypatch, name, batch_si
     for dense in (False, True):
         if dense:
             monkeypatch.setattr("torchblur.ops.pixels._DENSE", -1.0)
-            monkeypatch.setattr("torchblur.filters.reconstruction._ALMOST_ALL", -1.0)
+            monkeypatch.setattr("torchblur.filters.moving._ALMOST_ALL", -1.0)
         blur = without_notices(make(name))
         leaf = frame.color.clone().requires_grad_()
         given = dataclasses.replace(frame, color=leaf)
@@ -99,7 +99,7 @@ def test_parameters_of_all_shapes(monkeypatch, name, kind):
     with torch.no_grad():
         image = make(name)(frame, **{parameter: value})
         monkeypatch.setattr("torchblur.ops.pixels._DENSE", -1.0)
-        monkeypatch.setattr("torchblur.filters.reconstruction._ALMOST_ALL", -1.0)
+        monkeypatch.setattr("torchblur.filters.moving._ALMOST_ALL", -1.0)
         whole = make(name)(frame, **{parameter: value})
         for i in range(2) if kind != "per pixel" else ():
             single = frame.map(lambda t, i=i: t[i : i + 1]) if kind == "per image" else frame

@@ -1,0 +1,187 @@
+"""The part of a frame that moves, as lists of pixels: only there a filter has work to do."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from torchblur.filters.base import Values
+from torchblur.filters.reconstruction import TEXTURE_COLOR, texture_of
+from torchblur.filters.revealed import revealed_inputs
+from torchblur.filters.spreads import Spread, pixel_spread
+from torchblur.frame import Frame
+from torchblur.ops.gather import Inputs
+from torchblur.ops.noise import NoiseKind, noise_plane
+from torchblur.ops.pixels import PixelList, select, takes_all_pixels
+from torchblur.ops.tiles import tile_lookup, tile_offset
+from torchblur.ops.velocity import length
+
+__all__ = [
+    "Filtered",
+    "Moving",
+    "Stray",
+    "moving_part",
+    "moving_tiles",
+    "packed_values",
+    "revealed_part",
+]
+
+_ALMOST_ALL = 0.95  # from here on a choice costs more than it saves
+
+
+class Filtered(NamedTuple):
+    """What a filter computes: planes of tiles, and lists of the pixels that may change."""
+
+    tiles: dict[str, Tensor]
+    pixels: PixelList
+    lists: dict[str, Tensor]
+    """"color" (P, 3, 1, M), and other planes by name, (P, 1, 1, M)."""
+
+    @classmethod
+    def still(cls, frame: Frame, tiles: dict[str, Tensor], *names: str) -> Filtered:
+        """Return the result where nothing moves: the color, and 0 for all other planes."""
+        nowhere = torch.empty(0, dtype=torch.int64, device=frame.color.device)
+        none = frame.color.new_empty(1, 1, 1, 0)
+        lists = {"color": none.expand(1, 3, 1, 0)} | dict.fromkeys(names, none)
+        return cls(tiles, PixelList(*PixelList.all(frame.color).shape, nowhere), lists)
+
+    def color(self, frame: Frame) -> Tensor:
+        """Return the image, (B or P, 3, H, W); the frame's where nothing moves."""
+        return self.pixels.unpack(self.lists["color"], over=frame.color)
+
+    def layers(self, frame: Frame) -> dict[str, Tensor]:
+        """Return everything as images, the planes beside the color 0 where nothing moves."""
+        others = {n: self.pixels.unpack(p) for n, p in self.lists.items() if n != "color"}
+        return {"color": self.color(frame)} | others | self.tiles
+
+
+class Stray(NamedTuple):
+    """How pixels near the edge of a tile look up the motion of the tile beside theirs."""
+
+    noise: NoiseKind
+    amplitude: Tensor
+    """See `tile_offset`."""
+
+
+class Moving(NamedTuple):
+    """The part of a frame that a blur may change, as lists of pixels."""
+
+    pixels: PixelList
+    frame: Frame
+    """Its layers color, velocity, depth and validity, (1, C, 1, M) each."""
+    values: Values
+    """The parameters; what is given per pixel is a list, (P, 1, 1, M)."""
+    dominant: Tensor
+    """Longest half spread around the pixel's tile, px, (P, 2, 1, M)."""
+    tile_shift: Tensor | None
+    """How far the lookup of the tile strays, in tiles, (P, 2, 1, M)."""
+    spread: Spread
+    texture: Tensor
+    """What the taps look up, (B, 7 or 8, H, W); zero where none of them reaches."""
+    color_from: int
+    """First channel of the texture that may have a gradient: that of the color, or 0."""
+
+    def grid(self) -> tuple[Tensor, Tensor]:
+        """Return column and row of each pixel, (1, 1, 1, M) each."""
+        return self.pixels.grid(self.frame.color)
+
+
+def moving_part(
+    frame: Frame,
+    values: Values,
+    neighborhood: Tensor,
+    *,
+    stray: Stray | None = None,
+    uint8: bool = False,
+    margin: int = 0,
+) -> Moving | None:
+    """Return the pixels whose tiles move, and what their taps can read.
+
+    Args:
+        frame: The frame.
+        values: The parameters: `early_out`, shutter, tile size, seed.
+        neighborhood: Longest half spread around each tile, px, (B, 2, Ty, Tx).
+        stray: Whether a pixel's tile lookup may stray to a tile beside its own, and how.
+        uint8: Store vectors in eight bits.
+        margin: Pixels beyond the end of a blur that lookups read.
+
+    Returns:
+        The part; None if nothing moves and no gradient may be wanted.
+    """
+    tiles = moving_tiles(frame, values, neighborhood)
+    wanted = tiles if stray is None else _dilated(tiles, 1)
+    pixels = PixelList.in_tiles(wanted > 0, frame.color, values.tile_size)
+    if pixels.count == 0:
+        return None
+    color, shift = frame.color, None
+    if stray is not None:
+        noise = noise_plane(stray.noise, color, 1, values.seed, pixels)
+        amplitude = pixels.pack(stray.amplitude)
+        shift = tile_offset(color, noise, values.tile_size, amplitude, pixels)
+    dominant = tile_lookup(neighborhood, color, values.tile_size, shift, pixels=pixels)
+    chosen = _moving_pixels(dominant, pixels.pack(values.early_out))
+    if chosen is not None:
+        pixels, dominant = pixels.some(chosen), select(dominant, chosen)
+        shift = None if shift is None else select(shift, chosen)
+    layers = frame.only("depth", "valid")
+    here, local = layers.map(pixels.pack), packed_values(values, pixels)
+    spread = pixel_spread(here, local, uint8=uint8)
+    if pixels.index is None:
+        texture = pixels.unpack(texture_of(here, spread))
+    else:
+        far = -(-(values.tile_size + margin) // values.tile_size)
+        reached = PixelList.in_tiles(_dilated(wanted, far) > 0, color, values.tile_size)
+        there = layers.map(reached.pack)
+        read = pixel_spread(there, packed_values(values, reached), uint8=uint8)
+        texture = reached.unpack(texture_of(there, read))
+    motion = (frame.velocity, values.shutter, frame.finite_depth())
+    color_from = 0 if any(plane.requires_grad for plane in motion) else TEXTURE_COLOR
+    return Moving(pixels, here, local, dominant, shift, spread, texture, color_from)
+
+
+def moving_tiles(frame: Frame, values: Values, neighborhood: Tensor) -> Tensor:
+    """Return 1 for tiles that move, for any set of parameters, else 0, (B, 1, Ty, Tx)."""
+    least = values.early_out
+    if least.ndim == 4 and least.shape[0] > 1 and frame.batch_size == 1:
+        least = least.amin(0, keepdim=True)
+    if least.ndim == 4:
+        least = least.amin((2, 3), keepdim=True)
+    moving: Tensor = (length(neighborhood.detach()) > least).to(frame.dtype)
+    if torch.is_grad_enabled() and not takes_all_pixels() and not bool(moving.any()):
+        moving[..., 0, 0] = 1  # so that there is a graph
+    return moving
+
+
+def _moving_pixels(dominant: Tensor, least: Tensor) -> Tensor | None:
+    """Return which pixels of a list move, for any set; None: so many that all may be taken."""
+    if takes_all_pixels():
+        return None
+    moving = (length(dominant.detach()) > least).any(0).flatten()
+    count = int(moving.sum())
+    if count > _ALMOST_ALL * moving.shape[0] or (count == 0 and torch.is_grad_enabled()):
+        return None
+    return moving.nonzero()[:, 0]
+
+
+def revealed_part(
+    frame: Frame, values: Values, pixels: PixelList, blur: Callable[[Frame, Values], Tensor]
+) -> Inputs:
+    """Return `revealed_inputs` with lists of some pixels; arguments as there."""
+    return pixels.lists(revealed_inputs(frame, values, blur))
+
+
+def _dilated(mask: Tensor, tiles: int) -> Tensor:
+    return F.max_pool2d(mask, 2 * tiles + 1, stride=1, padding=tiles)
+
+
+def packed_values(values: Values, pixels: PixelList) -> Values:
+    """Return the parameters with those that are given per pixel as lists of some pixels."""
+    packed = {
+        key: pixels.pack(value) if isinstance(value, Tensor) else value
+        for key, value in vars(values).items()
+    }
+    return Values(**packed)

@@ -1,0 +1,92 @@
+"""Half spreads: how far pixels and tiles blur to each side while the shutter is open."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from torch import Tensor
+
+from torchblur.filters.base import Values
+from torchblur.frame import Frame, Shutter
+from torchblur.ops.tiles import neighbor_max, tile_max
+from torchblur.ops.velocity import clamp_length, direction, half_velocity, length, quantize_uint8
+
+__all__ = ["Spread", "Tiles", "longest_spread", "pixel_spread", "spread_of", "tiles_of"]
+
+
+class Spread(NamedTuple):
+    """Half spread of each pixel, clamped to what the tiles can reach."""
+
+    half: Tensor
+    """V in px, (B, 2, H, W)."""
+    length: Tensor
+    """|V| in px, (B, 1, H, W)."""
+    unit: Tensor
+    """V / |V|, or 0 for a still pixel, (B, 2, H, W)."""
+
+
+class Tiles(NamedTuple):
+    """Longest half spreads per tile in px, (B, 2, Ty, Tx): of the tile, and of those around."""
+
+    own: Tensor
+    neighborhood: Tensor
+
+
+def spread_of(
+    frame: Frame, values: Values, *, uint8: bool = False, cull: bool = False
+) -> tuple[Spread, Tiles]:
+    """Return the half spreads of a frame, per pixel and per tile; see `tiles_of`.
+
+    Args:
+        frame: The frame.
+        values: Shutter and tile size.
+        uint8: Store per-pixel vectors in eight bits, and choose among those.
+        cull: Leave out diagonal tiles that cannot reach the middle one.
+    """
+    return pixel_spread(frame, values, uint8=uint8), tiles_of(frame, values, uint8=uint8, cull=cull)
+
+
+def pixel_spread(frame: Frame, values: Values, *, uint8: bool = False) -> Spread:
+    """Return the half spread of each pixel.
+
+    With a shutter that is not centered the taps reach twice as far from the pixel, so that the
+    longest half spread is half a tile.
+
+    Args:
+        frame: The frame, or a list of its pixels.
+        values: Shutter and tile size.
+        uint8: Store vectors in eight bits.
+    """
+    half = half_velocity(frame.velocity, values.shutter, longest_spread(values))
+    if uint8:
+        half = quantize_uint8(half, values.tile_size)
+    return Spread(half, length(half), direction(half))
+
+
+def longest_spread(values: Values) -> float:
+    """Return the longest half spread that the tiles can reach, px."""
+    return float(values.tile_size / (1 + abs(Shutter(1, values.shutter_position).center)))
+
+
+def tiles_of(frame: Frame, values: Values, *, uint8: bool = False, cull: bool = False) -> Tiles:
+    """Return the longest half spread of each tile, and of the tiles around it.
+
+    Tiles choose by the length before it is clamped: clamped vectors are all equally long, and
+    rounding would choose among them.
+
+    Args:
+        frame: The frame.
+        values: Shutter and tile size.
+        uint8: Choose among vectors stored in eight bits.
+        cull: Leave out diagonal tiles that cannot reach the middle one.
+    """
+    if uint8:
+        tiles = tile_max(pixel_spread(frame, values, uint8=True).half, values.tile_size)
+        return Tiles(tiles, neighbor_max(tiles, cull=cull))
+    if values.shutter.ndim == 4 and values.shutter.shape[-2:] == frame.size:
+        tiles = tile_max(half_velocity(frame.velocity, values.shutter), values.tile_size)
+    else:  # one factor for all pixels of an image does not change which is the longest
+        tiles = half_velocity(tile_max(frame.velocity, values.tile_size), values.shutter)
+    longest = longest_spread(values)
+    around = neighbor_max(tiles, cull=cull)
+    return Tiles(clamp_length(tiles, longest), clamp_length(around, longest))
