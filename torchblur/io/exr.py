@@ -7,18 +7,17 @@ the dicts that it is given, and reports damaged pixels on the console instead of
 from __future__ import annotations
 
 import json
-import os
-import struct
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 import numpy as np
 import OpenEXR
 from numpy.typing import NDArray
 
 from torchblur.errors import FileFormatError, OutputError
+from torchblur.io.exr_blocks import check_complete
 from torchblur.io.paths import input_file, output_file
 
 __all__ = [
@@ -41,9 +40,6 @@ METADATA_KEY = "torchblur"
 
 _LOSSLESS = ("none", "rle", "zips", "zip", "piz", "zstd")
 _TYPES = {"float16": "half", "float32": "float", "uint32": "uint"}
-_DEEP = 0x800
-_MULTIPART = 0x1000
-_TILED = 0x200
 
 
 @dataclass(frozen=True)
@@ -229,7 +225,7 @@ def _whole_file(path: str | Path) -> Path:
     path = input_file(path)
     if not OpenEXR.isOpenExrFile(str(path)):
         raise FileFormatError(f"{path} is not an OpenEXR file; it begins with {_head(path)}")
-    _check_complete(path)
+    check_complete(path)
     return path
 
 
@@ -294,68 +290,6 @@ def _plain(value: Any) -> Any:
 def _head(path: Path) -> str:
     with path.open("rb") as file:
         return repr(file.read(12))
-
-
-def _check_complete(path: Path) -> None:
-    """Refuse a file that ends before its last block of pixels.
-
-    OpenEXR would print about it and go on; this says it as an error, before.
-    """
-    size = path.stat().st_size
-    with path.open("rb") as file:
-        try:
-            flags = struct.unpack("<4xI", file.read(8))[0]
-            _skip_headers(file, multipart=bool(flags & _MULTIPART))
-            last = _last_block(file)
-            end = _end_of_block(file, last, flags)
-        except (struct.error, EOFError):
-            end = size + 1
-    if end > size:
-        raise FileFormatError(
-            f"{path} is truncated: it ends after {size} bytes, before its last block of pixels; "
-            "was the render or the copy interrupted?"
-        )
-
-
-def _skip_headers(file: BinaryIO, *, multipart: bool) -> None:
-    while True:
-        name = _text(file)
-        if not name and not (multipart and (name := _text(file))):
-            return
-        _text(file)
-        file.seek(struct.unpack("<i", file.read(4))[0], os.SEEK_CUR)
-
-
-def _text(file: BinaryIO) -> bytes:
-    text = b""
-    while (byte := file.read(1)) != b"\0":
-        if not byte:
-            raise EOFError
-        text += byte
-    return text
-
-
-def _last_block(file: BinaryIO) -> int:
-    """Return the largest offset of the table that follows the headers.
-
-    The table ends where the first block begins.
-    """
-    first, last = struct.unpack("<Q", file.read(8)) * 2
-    while file.tell() < first:
-        offset = struct.unpack("<Q", file.read(8))[0]
-        first, last = min(first, offset), max(last, offset)
-    if first < file.tell():  # zero: the table was never filled in
-        raise EOFError
-    return int(last)
-
-
-def _end_of_block(file: BinaryIO, offset: int, flags: int) -> int:
-    """Return where a block ends, or less for tiles in a file of several parts and for deep ones."""
-    if flags & _DEEP:
-        return offset + 8
-    place_of_size = 8 if flags & _MULTIPART else 16 if flags & _TILED else 4
-    file.seek(offset + place_of_size)
-    return int(struct.unpack("<i", file.read(4))[0]) + file.tell()
 
 
 # -- writing -----------------------------------------------------------------------------------
