@@ -18,6 +18,7 @@ from torchblur.errors import ConfigError
 from torchblur.filters import BlurFilter, get_filter, registered_filters
 from torchblur.io.yaml import load_yaml, save_yaml
 from torchblur.ops.compiling import EngineChoice
+from torchblur.ops.gather import Storage
 from torchblur.params import Config, build
 
 __all__ = ["Preset", "create_filter", "load_preset", "save_preset"]
@@ -71,13 +72,18 @@ def save_preset(
 
 
 def create_filter(
-    name_or_preset: str | Path, *, engine: EngineChoice = "auto", **params: Any
+    name_or_preset: str | Path,
+    *,
+    engine: EngineChoice = "auto",
+    storage: Storage = "full",
+    **params: Any,
 ) -> BlurFilter:
     """Make a filter from its name or from a preset file.
 
     Args:
         name_or_preset: A registered name ("guertin2014"), or the path of a preset.
         engine: "auto", "eager" or "compiled"; see `BlurFilter`.
+        storage: "full" or "half"; see `BlurFilter`.
         **params: Single parameters over the preset's: ``num_samples=15, kappa=30.0``.
 
     Returns:
@@ -94,4 +100,4 @@ def create_filter(
     if name not in registered_filters() and (Path(name).suffix or Path(name).exists()):
         preset = load_preset(name)
         name, params = preset.filter, preset.params | params
-    return get_filter(name)(None, engine=engine, **params)
+    return get_filter(name)(None, engine=engine, storage=storage, **params)

@@ -1,7 +1,7 @@
 import pytest
 import torch
 
-from torchblur.ops.gather import gather, lookup, pixel_grid, read, weighted
+from torchblur.ops.gather import gather, lookup, pixel_grid, read, stored_as, weighted
 from torchblur.ops.pixels import PixelList
 
 
@@ -82,6 +82,42 @@ def test_compiled_gradient_of_a_texture_in_any_layout(strided):
         grads.append(leaf.grad)
     assert grads[0].any()
     assert torch.allclose(*grads, rtol=1e-4, atol=1e-5)
+
+
+class TestHalfStorage:
+    @pytest.mark.parametrize("mode", ["nearest", "bilinear"])
+    @pytest.mark.parametrize("engine", ["eager", "compiled"])
+    def test_is_a_texture_rounded_before(self, mode, engine):
+        results = []
+        for storage in ("half", "full"):
+            inputs = make_inputs(2, dtype=torch.float32)
+            if storage == "full":
+                inputs["texture"] = inputs["texture"].half().float()
+            leaves = {k: v.clone().requires_grad_() for k, v in inputs.items()}
+            with stored_as(storage):
+                color, weight = gather(tap, mode, 3, leaves, engine)
+            ((1e-5 * color.square()).sum() + weight.sum()).backward()  # half has nothing so small
+            results.append(
+                [color, weight, *(v.grad for v in leaves.values() if v.grad is not None)]
+            )
+        for half, full in zip(*results, strict=True):
+            assert half.dtype == torch.float32
+            assert torch.allclose(half, full, rtol=1e-4, atol=1e-9)
+
+    def test_error_is_that_of_rounding(self):
+        inputs = make_inputs(dtype=torch.float32)
+        whole, _ = gather(tap, "nearest", 3, inputs)
+        with stored_as("half"):
+            half, _ = gather(tap, "nearest", 3, inputs)
+        error = (half / whole - 1).abs().max()
+        assert 1e-5 < error < 2**-11
+
+    def test_infinite_depth_becomes_a_large_one(self):
+        inputs = make_inputs(dtype=torch.float32)
+        inputs["texture"] = torch.full_like(inputs["texture"], torch.inf)
+        with stored_as("half"):
+            color, weight = gather(tap, "nearest", 3, inputs)
+        assert torch.allclose(color, 65504 * weight)
 
 
 def test_many_rows_are_interpolated_from_their_corners(monkeypatch):

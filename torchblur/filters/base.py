@@ -11,7 +11,7 @@ import copy
 import math
 from collections import abc
 from dataclasses import dataclass
-from typing import Annotated, Any, ClassVar
+from typing import Annotated, Any, ClassVar, get_args
 
 from torch import Tensor
 
@@ -19,7 +19,7 @@ from torchblur.configured import ConfiguredModule, Values, batch_size_of
 from torchblur.errors import ConfigError, nearest_name
 from torchblur.frame import LONGEST_SHUTTER, Frame, Sequence, Shutter, ShutterPosition
 from torchblur.ops.compiling import EngineChoice, compiler_works, worth_compiling
-from torchblur.ops.gather import Engine
+from torchblur.ops.gather import Engine, Storage, stored_as
 from torchblur.params import Config, Param
 
 __all__ = [
@@ -73,6 +73,8 @@ class BlurFilter(ConfiguredModule):
         config: The parameters; the paper's if left out.
         engine: "eager"; "compiled" to compile the tap function (once per structure, on the first
             call); or "auto": compiled for a `sequence` that is worth it, eager else.
+        storage: "half" keeps what the taps look up in 16 bits: less memory traffic, where that is
+            the limit; see `ops.gather.stored_as` for the error.
         **params: Single parameters by name, over those of `config`.
 
     Raises:
@@ -93,10 +95,18 @@ class BlurFilter(ConfiguredModule):
             _REGISTRY[cls.name] = cls
 
     def __init__(
-        self, config: FilterConfig | None = None, *, engine: EngineChoice = "auto", **params: Any
+        self,
+        config: FilterConfig | None = None,
+        *,
+        engine: EngineChoice = "auto",
+        storage: Storage = "full",
+        **params: Any,
     ) -> None:
         super().__init__(config, **params)
         self._engine: EngineChoice = engine
+        if storage not in get_args(Storage):
+            raise ConfigError(f"`storage` must be 'full' or 'half', got {storage!r}")
+        self.storage: Storage = storage
 
     @property
     def engine(self) -> Engine:
@@ -124,7 +134,8 @@ class BlurFilter(ConfiguredModule):
             for a whole batch of parameter values may have a batch of one.
         """
         frame, values = self._prepared(frame, overrides)
-        layers = self.compute(frame, values)
+        with stored_as(self.storage):
+            layers = self.compute(frame, values)
         return layers | {"color": _one_per_set(layers["color"], values)}
 
     def engine_for(self, pixels: float) -> Engine:
@@ -154,7 +165,8 @@ class BlurFilter(ConfiguredModule):
             **overrides: Values of parameters for this call.
         """
         frame, values = self._prepared(frame, overrides)
-        return _one_per_set(self.color(frame, values), values)
+        with stored_as(self.storage):
+            return _one_per_set(self.color(frame, values), values)
 
     def color(self, frame: Frame, values: Values) -> Tensor:
         """Return "color" of `compute`; a filter may have a shorter way to it."""
@@ -221,7 +233,8 @@ class TemporalBlur(BlurFilter):
             history.size != samples[0].size or history.batch_size != batch_size
         ):
             history = None
-        return self.advance(samples, history, values)
+        with stored_as(self.storage):
+            return self.advance(samples, history, values)
 
     def advance(
         self, samples: tuple[Frame, ...], history: History | None, values: Values

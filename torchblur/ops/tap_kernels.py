@@ -100,8 +100,9 @@ def flat(added: Added) -> Planes:
 
 
 def floating(inputs: Inputs) -> Tensor:
-    """Return the first floating tensor: its type and device are those of the sums."""
-    return next(t for t in inputs.values() if t.is_floating_point())
+    """Return the first floating tensor of the widest type: the sums are like it."""
+    tensors = [tensor for tensor in inputs.values() if tensor.is_floating_point()]
+    return max(tensors, key=lambda tensor: tensor.element_size())
 
 
 @functools.lru_cache(maxsize=256)

@@ -52,6 +52,8 @@ class Lists(NamedTuple):
     be worked on in parts, and read textures by `ops.gather.read` alone. None: no lists."""
     color_from: int = 0
     """Of the channels of "texture" before this one no gradient is wanted."""
+    storage: torch.dtype | None = None
+    """Type in which textures are kept while taps read them; None: as they come."""
 
 
 def sum_taps(
@@ -168,6 +170,19 @@ class _Sum:
         """Whether a tensor is a list of pixels, of which a part can be taken."""
         return tensor.ndim == 4 and tensor.shape[-1] == self.lists.num_pixels
 
+    def stored(self, inputs: Inputs) -> Inputs:
+        """Return inputs whose textures have the type in which they are kept."""
+        storage = self.lists.storage
+        if storage is None:
+            return inputs
+        most = torch.finfo(storage).max  # an infinite depth would be NaN in a difference
+        return {
+            name: tensor.clamp(-most, most).to(storage)
+            if tensor.ndim == 3 and tensor.is_floating_point()
+            else tensor
+            for name, tensor in inputs.items()
+        }
+
     def parts(self, like: Tensor) -> list[slice | None]:
         """Return parts of about equal size; [None] for all pixels at once."""
         if self.lists.num_pixels is None or like.device.type != "cpu":
@@ -195,7 +210,7 @@ class _Sum:
 def _run(job: _Sum, inputs: Inputs) -> Planes:
     if torch.is_grad_enabled() and any(t.requires_grad for t in inputs.values()):
         return _apply(job, tuple(inputs), *inputs.values())
-    return _sum(job, inputs)
+    return _sum(job, job.stored(inputs))
 
 
 class _SumTaps(torch.autograd.Function):
@@ -204,8 +219,10 @@ class _SumTaps(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, job: _Sum, names: tuple[str, ...], *tensors: Tensor) -> Planes:
         ctx.job, ctx.names = job, names
-        sums = _sum(job, dict(zip(names, tensors, strict=True)))
-        ctx.save_for_backward(*tensors, *sums[job.form.num_summed :])
+        stored = job.stored(dict(zip(names, tensors, strict=True)))
+        sums = _sum(job, stored)
+        ctx.types = {name: tensor.dtype for name, tensor in zip(names, tensors, strict=True)}
+        ctx.save_for_backward(*stored.values(), *sums[job.form.num_summed :])
         return sums
 
     @staticmethod
@@ -215,17 +232,21 @@ class _SumTaps(torch.autograd.Function):
         tensors = [tensor.detach() for tensor in ctx.saved_tensors]
         named = dict(zip(ctx.names, tensors[: len(needed)], strict=True))
         wanted = [name for name, needs in zip(ctx.names, needed, strict=True) if needs]
-        # Contiguous, whatever the input is: what is scattered goes into a flat view of them.
-        totals = {name: named[name].new_zeros(named[name].shape) for name in wanted}
-        textures = [name for name in wanted if job.lists.num_pixels and named[name].ndim == 3]
         in_place = job.kernel.engine == "compiled"
+        if not in_place:  # a gradient has the type of what it is of: half would lose small ones
+            named = {name: tensor.to(ctx.types[name]) for name, tensor in named.items()}
+        # Contiguous, whatever the input is: what is scattered goes into a flat view of them.
+        totals = {
+            name: named[name].new_zeros(named[name].shape, dtype=ctx.types[name]) for name in wanted
+        }
+        textures = [name for name in wanted if job.lists.num_pixels and named[name].ndim == 3]
         # Any pixel of a texture may be read by any part: its gradient is one sum over all of them.
         whole = bool(textures) and not in_place
         scattered = {name: totals[name].view(-1) for name in textures if in_place}
         for part in [None] if whole else job.parts(floating(named)):
-            cut = [job.part(tensor, part) for tensor in (*tensors, *grads)]
-            pieces = dict(zip(ctx.names, cut, strict=False))
-            pulled = _pull(job, pieces, wanted, scattered, cut[len(needed) :])
+            pieces = {name: job.part(tensor, part) for name, tensor in named.items()}
+            rest = [job.part(tensor, part) for tensor in (*tensors[len(needed) :], *grads)]
+            pulled = _pull(job, pieces, wanted, scattered, rest)
             for name, piece in pulled.items():
                 if part is not None and not job.is_list(totals[name]):
                     piece = totals[name] + piece
