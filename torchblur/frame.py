@@ -21,7 +21,6 @@ from __future__ import annotations
 
 import dataclasses
 import math
-import warnings
 from collections import abc
 from collections.abc import Callable, Iterator
 from dataclasses import InitVar, dataclass
@@ -31,6 +30,7 @@ import torch
 from torch import Tensor
 
 from torchblur.errors import FrameError
+from torchblur.layers import CHANNELS, check_agreement, shaped, without_bad_values
 
 __all__ = ["FAR_DEPTH", "LONGEST_SHUTTER", "Frame", "Sequence", "Shutter", "ShutterPosition"]
 
@@ -45,19 +45,6 @@ LONGEST_SHUTTER = 8.0
 Above 1 it is no film camera but a game: 1/60 s at 100 to 300 frames a second (Tan 2022, section 4)
 are 1.7 to 5 frames.
 """
-
-_CHANNELS = {
-    "color": 3,
-    "depth": 1,
-    "velocity": 2,
-    "normal": 3,
-    "object_id": 1,
-    "time": 1,
-    "acceleration": 2,
-    "albedo": 3,
-    "valid": 1,
-}
-_FINITE = ("color", "velocity", "normal", "time", "acceleration", "albedo")
 
 
 @dataclass(frozen=True)
@@ -175,12 +162,15 @@ class Frame:
     def __post_init__(self, on_invalid: Literal["raise", "mask"]) -> None:
         if on_invalid not in ("raise", "mask"):
             raise FrameError(f"`on_invalid` must be 'raise' or 'mask', got {on_invalid!r}")
-        for name in _CHANNELS:
+        for name in CHANNELS:
             layer = getattr(self, name)
             if layer is not None:
-                self._set(name, self._shaped(name, layer))
-        self._check_agreement()
-        self._check_values(on_invalid)
+                self._set(name, shaped(name, layer, self._place()))
+        check_agreement(self.layers(), self._place())
+        self._check_revealed()
+        usable = without_bad_values(self.layers(), on_invalid, self._place())
+        for name, layer in usable.items():
+            self._set(name, layer)
 
     @classmethod
     def unchecked(cls, **fields: Any) -> Frame:
@@ -246,7 +236,7 @@ class Frame:
 
     def layers(self) -> dict[str, Tensor]:
         """Return the tensors that are present, by name (without `revealed`)."""
-        return {name: t for name in _CHANNELS if (t := getattr(self, name)) is not None}
+        return {name: t for name in CHANNELS if (t := getattr(self, name)) is not None}
 
     # -- other frames --------------------------------------------------------------------------
 
@@ -334,7 +324,7 @@ class Frame:
         if len(sizes) > 1:
             names = ", ".join(f"{w}x{h}" for h, w in sorted(sizes))
             raise FrameError(f"the frames of a batch must have one size, got {names}")
-        common = [n for n in _CHANNELS if all(getattr(f, n) is not None for f in frames)]
+        common = [n for n in CHANNELS if all(getattr(f, n) is not None for f in frames)]
         layers = {name: torch.cat([getattr(f, name) for f in frames]) for name in common}
         revealed = [f.revealed for f in frames if f.revealed is not None]
         return Frame(
@@ -351,74 +341,12 @@ class Frame:
     def _place(self) -> str:
         return f" ({self.source})" if self.source else ""
 
-    def _shaped(self, name: str, layer: Tensor) -> Tensor:
-        if not isinstance(layer, Tensor):
-            raise FrameError(f"`{name}` must be a tensor, got {type(layer).__name__}")
-        if layer.ndim == 3:
-            layer = layer[None]
-        channels = _CHANNELS[name]
-        if layer.ndim != 4 or layer.shape[1] != channels or 0 in layer.shape:
-            raise FrameError(
-                f"`{name}` must have shape (B, {channels}, H, W), got "
-                f"{tuple(layer.shape)}{self._place()}"
-            )
-        if name not in ("object_id", "valid") and not layer.is_floating_point():
-            raise FrameError(f"`{name}` must be floating point, got {layer.dtype}{self._place()}")
-        return layer
-
-    def _check_agreement(self) -> None:
-        for name, layer in self.layers().items():
-            for what, got, want in (
-                ("batch and size", _batch_and_size(layer), _batch_and_size(self.color)),
-                ("device", layer.device, self.device),
-                ("type", layer.dtype, self.dtype),
-            ):
-                if what == "type" and name in ("object_id", "valid"):
-                    continue
-                if got != want:
-                    raise FrameError(
-                        f"all layers must have one {what}: `color` has {want}, "
-                        f"`{name}` has {got}{self._place()}"
-                    )
+    def _check_revealed(self) -> None:
         if self.revealed is not None and self.revealed.size != self.size:
             raise FrameError(
                 f"`revealed` must have the size of the frame, {self.size}, "
                 f"got {self.revealed.size}{self._place()}"
             )
-
-    def _check_values(self, on_invalid: str) -> None:
-        bad_pixels = torch.zeros_like(self.color[:, :1], dtype=torch.bool)
-        for name in _FINITE:
-            layer = getattr(self, name)
-            if layer is not None:
-                bad = ~torch.isfinite(layer)
-                bad_pixels |= self._handle(name, layer, bad, on_invalid, "be finite", 0.0)
-        if self.depth is not None:
-            bad = ~(self.depth > 0)
-            rule = "be a positive distance (or +inf)"
-            bad_pixels |= self._handle("depth", self.depth, bad, on_invalid, rule, math.inf)
-        if bool(bad_pixels.any()):
-            valid = ~bad_pixels if self.valid is None else self.valid.bool() & ~bad_pixels
-            self._set("valid", valid)
-
-    def _handle(
-        self, name: str, layer: Tensor, bad: Tensor, on_invalid: str, rule: str, filler: float
-    ) -> Tensor:
-        """Refuse or replace bad values; return the bad pixels, (B, 1, H, W)."""
-        pixels = bad.any(dim=1, keepdim=True)
-        if not bool(pixels.any()):
-            return pixels
-        b, c, y, x = (int(i) for i in bad.nonzero()[0])
-        text = (
-            f"`{name}` must {rule}, got {int(bad.sum())} values that are not, the first "
-            f"{float(layer[b, c, y, x])} in channel {c} at x={x}, y={y} of frame {b}"
-            f"{self._place()}"
-        )
-        if on_invalid == "raise":
-            raise FrameError(f'{text}; on_invalid="mask" replaces them')
-        warnings.warn(f"{text}; replaced by {filler:g} and masked", stacklevel=5)
-        self._set(name, torch.where(bad, torch.full_like(layer, filler), layer))
-        return pixels
 
 
 @dataclass(frozen=True, eq=False)
@@ -467,7 +395,3 @@ class Sequence:
     def map(self, function: Callable[[Frame], Frame]) -> Sequence:
         """Return the sequence with a function applied to each frame (a crop, a move)."""
         return Sequence(tuple(function(frame) for frame in self.frames), self.cuts)
-
-
-def _batch_and_size(layer: Tensor) -> tuple[int, int, int]:
-    return layer.shape[0], layer.shape[2], layer.shape[3]
