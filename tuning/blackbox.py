@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
@@ -21,17 +21,18 @@ import optuna
 import torch
 from optuna.trial import FrozenTrial, Trial, TrialState, create_trial
 
-from tuning.blackbox_study import Journal, make_pruner, make_sampler, new_study, suggest
+from tuning.blackbox_study import make_pruner, make_sampler, new_study, suggest
 from tuning.candidates import evaluate_candidates
 from tuning.fidelity import Climb, Ladder
 from tuning.gradient import FitError, seed_of
+from tuning.job import MethodJob
 from tuning.method_config import BlackBoxMethod
 from tuning.polish import Polished, PolishStart, is_promising, polish
 from tuning.problem import Problem
-from tuning.progress import Progress, Stage
+from tuning.progress import Progress
 from tuning.result import MethodResult
+from tuning.rounds import run_rounds
 from tuning.runfolder import RunFolder
-from tuning.space import Space
 
 __all__ = ["BlackBoxJob", "fit_blackbox"]
 
@@ -40,27 +41,15 @@ _WINDOWS_SEED, _POLISH_SEED = 1 << 41, 1 << 42
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class BlackBoxJob:
+class BlackBoxJob(MethodJob):
     """What a black-box fit works on.
 
     Args:
         method: Its settings.
-        index: Its position among the methods.
-        name: Its name in results.
-        space: The parameters that it fits.
-        fixed: Values of the free parameters that it does not fit.
-        first: Points to evaluate before the sampler's.
-        seed: Seed of the run.
         polished: Names of the parameters that are polished by gradient.
     """
 
     method: BlackBoxMethod
-    index: int
-    name: str
-    space: Space
-    fixed: Mapping[str, Any]
-    first: tuple[Mapping[str, Any], ...]
-    seed: int
     polished: tuple[str, ...] = ()
 
 
@@ -86,24 +75,7 @@ def fit_blackbox(
         FitError: no trial has a finite loss.
     """
     search = _Search(problem, job)
-    journal = None if folder is None else Journal(folder, job.index)
-    for trial in journal.trials() if journal is not None else ():
-        search.study.add_trial(trial)
-    if folder is not None:
-        trials = search.study.trials
-        logged = folder.drop_records(job.index, len(trials))
-        for trial in trials:
-            if trial.number not in logged:
-                _log(folder, job, trial)
-    stage = Stage(job.name, job.method.trials, progress, done=search.drawn)
-    while search.drawn < job.method.trials:
-        trials = search.round()
-        for position, trial in enumerate(trials):
-            if folder is not None and journal is not None:
-                journal.add(trial, ends_round=position == len(trials) - 1)
-                _log(folder, job, trial)
-        last = [t.value for t in trials if t.state == TrialState.COMPLETE and t.value is not None]
-        stage.step(search.drawn, loss=min(last, default=None), best=search.best)
+    run_rounds(search, job, job.method.trials, _record, folder, progress)
     return search.result()
 
 
@@ -288,20 +260,19 @@ def _passes(after: Polished, job: BlackBoxJob, problem: Problem) -> float:
     return 1 + (after.evaluations - 1) * batch / total
 
 
-def _log(folder: RunFolder, job: BlackBoxJob, trial: FrozenTrial) -> None:
+def _record(trial: FrozenTrial) -> dict[str, Any]:
     is_pruned = trial.state == TrialState.PRUNED
     known = ("passes", "cpu_seconds", _POLISHED)
     extra = {name: trial.user_attrs[name] for name in known if name in trial.user_attrs}
     if is_pruned:
         extra["pruned"] = trial.value
-    folder.log(
-        method=job.index,
-        kind="blackbox",
-        step=trial.number,
-        loss=[None if is_pruned else trial.value],
-        params={name: [value] for name, value in trial.params.items()},
+    return {
+        "kind": "blackbox",
+        "step": trial.number,
+        "loss": [None if is_pruned else trial.value],
+        "params": {name: [value] for name, value in trial.params.items()},
         **extra,
-    )
+    }
 
 
 def _importances(study: optuna.Study, complete: int) -> dict[str, float]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
+import uuid
 import warnings
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -38,7 +38,8 @@ def cached(key: str, make: Callable[[], dict[str, Tensor]]) -> dict[str, Tensor]
     tensors = {name: tensor.contiguous() for name, tensor in make().items()}
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        temporary = path.with_name(f".{path.name}.{os.getpid()}.part")
+        # Another machine may have a process of the same number, and the same cache.
+        temporary = path.with_name(f".{path.name}.{uuid.uuid4().hex}.part")
         torch.save(tensors, temporary)
         temporary.replace(path)
     except OSError as error:

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -19,6 +18,7 @@ from torch import Tensor
 
 from torchblur.errors import TorchblurError
 from tuning.config import GradientMethod
+from tuning.job import MethodJob
 from tuning.problem import Problem
 from tuning.progress import Progress, Stage
 from tuning.result import MethodResult, StartResult
@@ -36,26 +36,14 @@ class FitError(TorchblurError):
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class GradientJob:
+class GradientJob(MethodJob):
     """What a gradient fit works on.
 
     Args:
         method: Its settings.
-        index: Its position among the methods.
-        name: Its name in results.
-        space: The parameters that it fits.
-        fixed: Values of the free parameters that it does not fit.
-        first: Points to begin with, before the random ones.
-        seed: Seed of the run.
     """
 
     method: GradientMethod
-    index: int
-    name: str
-    space: Space
-    fixed: Mapping[str, Any]
-    first: tuple[Mapping[str, Any], ...]
-    seed: int
 
     @property
     def checkpoint(self) -> str:

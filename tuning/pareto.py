@@ -20,18 +20,20 @@ import optuna
 from optuna.samplers import BaseSampler, NSGAIISampler, TPESampler
 from optuna.trial import FrozenTrial, Trial, TrialState, create_trial
 
-from tuning.blackbox_study import Journal, new_study, suggest
+from tuning.blackbox_study import new_study, suggest
 from tuning.candidates import evaluate_candidates
 from tuning.cost import cost_at
 from tuning.gradient import FitError, seed_of
+from tuning.job import MethodJob
 from tuning.method_config import ParetoMethod
 from tuning.pareto_result import ParetoPoint, ParetoResult, front_of, make_point, pick
 from tuning.polish import Polished, PolishStart, polish
 from tuning.problem import Problem
 from tuning.progress import Progress, Stage
 from tuning.result import MethodResult
+from tuning.rounds import run_rounds
 from tuning.runfolder import RunFolder
-from tuning.space import FreeParameter, Space
+from tuning.space import FreeParameter
 
 __all__ = ["ParetoJob", "fit_pareto"]
 
@@ -42,26 +44,14 @@ _ENOUGH = 10  # trials; the importances of fewer tell nothing
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class ParetoJob:
-    """What a search for the front works on.
+class ParetoJob(MethodJob):
+    """What a search for the front works on; the sweep starts from the last of `first`.
 
     Args:
         method: Its settings.
-        index: Its position among the methods.
-        name: Its name in results.
-        space: The parameters that it fits.
-        fixed: Values of the free parameters that it does not fit.
-        first: Points to evaluate before the sampler's; from the last one the sweep starts.
-        seed: Seed of the run.
     """
 
     method: ParetoMethod
-    index: int
-    name: str
-    space: Space
-    fixed: Mapping[str, Any]
-    first: tuple[Mapping[str, Any], ...]
-    seed: int
 
 
 def fit_pareto(
@@ -85,24 +75,7 @@ def fit_pareto(
         FitError: no trial has a finite loss.
     """
     search = _Search(problem, job)
-    journal = None if folder is None else Journal(folder, job.index, _OBJECTIVES)
-    for trial in journal.trials() if journal is not None else ():
-        search.study.add_trial(trial)
-    if folder is not None:
-        trials = search.study.trials
-        logged = folder.drop_records(job.index, len(trials))
-        for trial in trials:
-            if trial.number not in logged:
-                _log(folder, job, trial)
-    stage = Stage(job.name, job.method.trials, progress, done=search.drawn)
-    while search.drawn < job.method.trials:
-        trials = search.round()
-        for position, trial in enumerate(trials):
-            if folder is not None and journal is not None:
-                journal.add(trial, ends_round=position == len(trials) - 1)
-                _log(folder, job, trial)
-        last = [t.values[0] for t in trials if t.state == TrialState.COMPLETE]
-        stage.step(search.drawn, loss=min(last, default=None), best=search.best)
+    run_rounds(search, job, job.method.trials, _record, folder, progress)
     return search.result(_polished(search, folder, progress))
 
 
@@ -248,16 +221,15 @@ def _key(params: Mapping[str, Any]) -> tuple[tuple[str, Any], ...]:
     return tuple(sorted(params.items()))
 
 
-def _log(folder: RunFolder, job: ParetoJob, trial: FrozenTrial) -> None:
+def _record(trial: FrozenTrial) -> dict[str, Any]:
     known = trial.state == TrialState.COMPLETE
-    folder.log(
-        method=job.index,
-        kind="pareto",
-        step=trial.number,
-        loss=[trial.values[0] if known else None],
-        cost=trial.values[1] if known else None,
-        params={name: [value] for name, value in trial.params.items()},
-    )
+    return {
+        "kind": "pareto",
+        "step": trial.number,
+        "loss": [trial.values[0] if known else None],
+        "cost": trial.values[1] if known else None,
+        "params": {name: [value] for name, value in trial.params.items()},
+    }
 
 
 # -- given points ----------------------------------------------------------------------------------
