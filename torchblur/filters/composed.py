@@ -6,46 +6,29 @@ import math
 from typing import Any, NamedTuple
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 
 from torchblur.filters.base import BlurFilter, Values
 from torchblur.filters.composed_config import ComposedConfig
-from torchblur.filters.composed_gather import (
-    alternate_tap,
-    fill_hidden,
-    pair_tap,
-    shared_inputs,
-    tap_options,
-    time_tap,
-)
+from torchblur.filters.composed_gather import alternate_tap, pair_tap, shared_inputs, tap_options
+from torchblur.filters.composed_motion import clean_edges, half_spreads, moving_pixels, tile_planes
+from torchblur.filters.composed_times import fill_hidden, time_tap
 from torchblur.filters.guertin2014 import center_direction
-from torchblur.filters.moving import moving_tiles, packed_values
+from torchblur.filters.moving import packed_values
 from torchblur.filters.notes2025_gather import Blurred, Line, Sums, compose
 from torchblur.filters.notes2025_postfilter import post_filter
 from torchblur.filters.reconstruction import resolve, texture_of
 from torchblur.filters.revealed import revealed_inputs
 from torchblur.filters.spreads import Spread
-from torchblur.frame import Frame, Shutter
-from torchblur.ops.directions import TileDirections, tile_directions
+from torchblur.frame import Frame
 from torchblur.ops.gather import Engine, Inputs, gather_lists
-from torchblur.ops.noise import NoiseKind, noise_plane
 from torchblur.ops.pixels import PixelList
-from torchblur.ops.tiles import (
-    neighbor_max,
-    neighbor_min,
-    tile_lookup,
-    tile_max,
-    tile_min,
-    tile_offset,
-)
-from torchblur.ops.velocity import clamp_length, direction, half_velocity, length, quantize_uint8
+from torchblur.ops.velocity import direction, length
 from torchblur.ops.weights import power, saturate
 
 __all__ = ["ComposedBlur", "ComposedConfig", "composed"]
 _SHORTEST_REACH = 1e-3  # px; what is shorter has no direction either
 _TRACE = 1e-6  # weight per tap
-_LEVEL = 1e-6  # neighbors whose depths differ by less, as a share, are one surface
 
 
 def composed(frame: Frame, config: ComposedConfig | None = None, **params: Any) -> Tensor:
@@ -122,15 +105,15 @@ class ComposedBlur(BlurFilter):
 
 
 def _layers(frame: Frame, values: Values, engine: Engine) -> dict[str, Tensor]:
-    seen = _clean_edges(frame, values)
-    spread, tiles = _motion(seen, values)
-    pixels = _moving_pixels(seen, tiles, values)
+    seen = clean_edges(frame, values)
+    spread, tiles = half_spreads(seen, values)
+    pixels = moving_pixels(seen, tiles, values)
     if pixels.count == 0:
         none = torch.zeros_like(frame.color[:, :1])
         planes = dict.fromkeys(("alpha", "output_alpha", "weight"), none)
         return {"color": frame.color} | planes | tiles._asdict()
     here, local = seen.only("depth", "valid").map(pixels.pack), packed_values(values, pixels)
-    first, second, least = _tile_planes(seen.color, spread.length, tiles, pixels, values)
+    first, second, least = tile_planes(seen.color, spread.length, tiles, pixels, values)
     inputs = shared_inputs(here, texture_of(seen, spread), pixels, local)
     spread = Spread(*(pixels.pack(plane) for plane in spread))
     inputs |= {"half": spread.half, "length": spread.length}
@@ -159,98 +142,6 @@ def _unpacked(image: Blurred, frame: Frame, pixels: PixelList) -> Blurred:
     """Return images of the lists: all other pixels have their own color, and 0."""
     color, *planes = image
     return Blurred(pixels.unpack(color, over=frame.color), *(pixels.unpack(p) for p in planes))
-
-
-# -- motion ----------------------------------------------------------------------------------------
-
-
-def _clean_edges(frame: Frame, values: Values) -> Frame:
-    """Return the frame; beside something nearer, pixels have its motion (and its depth).
-
-    Renderers average motion over a pixel: at the edge of an object it is that of neither surface,
-    and nothing that follows it arrives.
-    """
-    depth = frame.finite_depth()
-    if values.edge_motion == "own":
-        return frame
-    depths = _around(depth)
-    nearest = depths.amin(1, keepdim=True)
-    same = (depths <= nearest * (1 + _LEVEL)).to(depth.dtype)
-    beside = depth * (1 - values.edge_depth) > nearest
-    share = same / same.sum(1, keepdim=True)
-    motion = [(_around(v) * share).sum(1, keepdim=True) for v in frame.velocity.split(1, 1)]
-    velocity = torch.where(beside, torch.cat(motion, 1), frame.velocity)
-    if values.edge_motion == "surface":
-        depth = torch.where(beside, nearest, depth)
-    return frame.replaced(velocity=velocity, depth=depth)
-
-
-def _around(plane: Tensor) -> Tensor:
-    """Return the 3x3 values around each pixel of one plane, (B, 9, H, W)."""
-    height, width = plane.shape[-2:]
-    padded = F.pad(plane, (1, 1, 1, 1), mode="replicate")
-    shifts = [(j, i) for j in range(3) for i in range(3)]
-    return torch.cat([padded[..., j : j + height, i : i + width] for j, i in shifts], 1)
-
-
-def _motion(frame: Frame, values: Values) -> tuple[Spread, TileDirections]:
-    """Return half spreads per pixel, exactly 0 where still, and both motions per tile."""
-    size = values.tile_size
-    longest = size / (1 + abs(Shutter(1, values.shutter_position).center))
-    whole = half_velocity(frame.velocity, values.shutter)
-    half = clamp_length(whole, longest)
-    if values.velocity_encoding == "uint8":
-        whole = half = quantize_uint8(half, size)
-    if values.second_direction:
-        tiles = tile_directions(
-            whole,
-            size,
-            reduction=values.direction_reduction,
-            cull=values.neighbor_culling,
-            exponent=_per_image(values.secondary_exponent),
-        )
-    else:
-        primary = neighbor_max(tile_max(whole, size), cull=values.neighbor_culling)
-        tiles = TileDirections(primary, torch.zeros_like(primary))
-    if values.velocity_encoding != "uint8":
-        tiles = TileDirections(*(clamp_length(tile, longest) for tile in tiles))
-    if values.velocity_encoding == "tiles":
-        tiles = TileDirections(*(quantize_uint8(tile, size) for tile in tiles))
-    unit = direction(half)
-    return Spread(half, torch.where((unit == 0).all(1, True), 0.0, length(half)), unit), tiles
-
-
-def _per_image(value: Tensor) -> Tensor:
-    """Return a parameter without its dependence on the pixel, for use per tile."""
-    return value.mean((-2, -1), keepdim=True) if value.ndim == 4 else value
-
-
-def _moving_pixels(frame: Frame, tiles: TileDirections, values: Values) -> PixelList:
-    """Return the pixels whose tiles move, or may look up one that does."""
-    wanted = moving_tiles(frame, values, tiles.primary)
-    if values.noise != "none" and bool((values.tile_jitter > 0).any()):
-        wanted = F.max_pool2d(wanted, 3, stride=1, padding=1)
-    return PixelList.in_tiles(wanted > 0, frame.color, values.tile_size)
-
-
-def _tile_planes(
-    color: Tensor, size: Tensor, tiles: TileDirections, pixels: PixelList, values: Values
-) -> list[Tensor]:
-    """Return both motions of the pixels' tiles, and the shortest half spread of the 3x3 tiles.
-
-    Args:
-        color: For its size, (B, 3, H, W).
-        size: Half spread of all pixels, px, (B, 1, H, W).
-        tiles: The motions.
-        pixels: Whose.
-        values: The parameters.
-    """
-    edge = values.tile_size
-    kind: NoiseKind = "gradient" if values.noise == "checkerboard" else values.noise
-    noise = noise_plane(kind, color, 1, values.seed, pixels)
-    offset = tile_offset(color, noise, edge, pixels.pack(values.tile_jitter), pixels)
-    least = neighbor_min(tile_min(size.detach(), edge))
-    return [tile_lookup(t, color, edge, offset, pixels=pixels) for t in (*tiles, least)]
 
 
 # -- taps ------------------------------------------------------------------------------------------

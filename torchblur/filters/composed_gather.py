@@ -1,4 +1,4 @@
-"""The gather of torchblur's own filter: three kinds of taps, one set of weights and sums."""
+"""Taps of torchblur's own filter: by turns, in pairs; weights and sums that all its taps share."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ import torch
 from torch import Tensor
 
 from torchblur.filters.base import Values
-from torchblur.filters.reconstruction import ColorLookup, Tap, is_one, sample
+from torchblur.filters.reconstruction import TEXTURE_COLOR, ColorLookup, Tap, is_one, sample
 from torchblur.frame import Frame, Shutter
 from torchblur.ops.cubic import second_differences
-from torchblur.ops.gather import Inputs, Planes, read, weighted
+from torchblur.ops.gather import Inputs, Planes, weighted
 from torchblur.ops.noise import dither_2x2, noise_plane
 from torchblur.ops.pixels import PixelList
 from torchblur.ops.spread import Mirror, SpreadForm, TapPair, mirror, spread_weight
@@ -19,17 +19,17 @@ from torchblur.ops.weights import DepthWeights, cone, cylinder, depth_weights, p
 
 __all__ = [
     "TAP_PARAMETERS",
+    "Added",
     "TapOptions",
     "alternate_tap",
-    "fill_hidden",
     "pair_tap",
+    "sample_classes",
     "shared_inputs",
+    "sum_planes",
     "tap_options",
-    "time_tap",
 ]
 
 _TINY = 1e-6
-_TIE = 1e-4  # weights as close are equal: rounding must not decide
 TAP_PARAMETERS = (
     "cone_slope",
     "cone_exponent",
@@ -133,136 +133,8 @@ def shared_inputs(frame: Frame, texture: Tensor, pixels: PixelList, values: Valu
         "extent": values.relative_depth_extent if relative else values.soft_depth_extent,
     }
     if values.color_lookup == "cubic":
-        inputs["texture_detail"] = second_differences(texture[:, 4:])
+        inputs["texture_detail"] = second_differences(texture[:, TEXTURE_COLOR:])
     return inputs | {key: getattr(values, key) for key in TAP_PARAMETERS}
-
-
-# -- a time at which all directions compete --------------------------------------------------------
-
-
-class _Arrival(NamedTuple):
-    """A sample that moves to the pixel."""
-
-    x: Tensor
-    y: Tensor
-    depth: Tensor
-    match: Tensor
-    """How well it does, in [0, 1]."""
-
-
-def time_tap(index: Tensor, count: Tensor, inputs: Inputs, options: TapOptions) -> Added:
-    """Return what the pixel shows at one time: what passes it then, and what else may lie behind.
-
-    Each direction names a sample that would be at the pixel at this time. How well its own
-    motion takes it there is its match; the nearer of those that match hides the others.
-    """
-    time = (2 * (index + 0.5 + inputs["shift"]) / count - 1).clamp(-1, 1) + options.center
-    found = [
-        _follow(inputs[f"{name}_vector"], time, inputs, options) for name in options.directions
-    ]
-    weights = []
-    open_share = torch.ones_like(found[0].match)
-    for one in found:
-        weight = one.match
-        for other in found:
-            if other is not one:
-                hidden = _classes(one.depth, other.depth, inputs, options).foreground
-                weight = weight * (1 - other.match * hidden)
-        open_share = open_share * (1 - one.match)
-        weights.append(weight)
-    total = sum(weights[1:], weights[0])
-    some = total > _TINY
-    covered = torch.where(some, 1 - open_share, 0.0)
-    colors = (_first_color if options.one_color else _mean_color)(found, weights, inputs, options)
-    share = inputs["foreground_gain"] * covered
-    *front, seen = (share * plane for plane in _added(*(color for _, color in colors)))
-    back, weight, hidden = _behind(time, 1 - covered, inputs, options)
-    if not options.fill_hidden:
-        return back, weight, tuple(front), seen, covered
-    near = covered * (1 - time.abs() / (1 + abs(options.center))).square()
-    visible = _added(*(weighted(near * is_visible, color) for is_visible, color in colors))
-    return (*back, *visible, hidden), weight, tuple(front), seen, covered
-
-
-def fill_hidden(back: Tensor, weight: Tensor, gain: Tensor) -> tuple[Tensor, Tensor]:
-    """Return color and weight of the back, hidden times filled with the pixel's own surface.
-
-    Args:
-        back: What `time_tap` sums up for it, (P, 8, 1, M): color; color and weight of what passes
-            the pixel and is not in front of it; the share of hidden times.
-        weight: Weight of that color, (P, 1, 1, M).
-        gain: `background_gain`.
-    """
-    color, visible, seen, hidden = back.split((3, 3, 1, 1), 1)
-    known = seen > _TINY
-    hidden = torch.where(known, hidden, 0.0)
-    filled = hidden * visible / torch.where(known, seen, 1.0)
-    return gain * (color + filled), gain * (weight + hidden)
-
-
-def _follow(vector: Tensor, time: Tensor, inputs: Inputs, options: TapOptions) -> _Arrival:
-    """Return the sample that moves to the pixel from where this motion would bring it."""
-    dx, dy = vector.split(1, 1)
-    for _ in range(options.refinements):
-        place = inputs["x"] - time * dx, inputs["y"] - time * dy
-        ux, uy, size = read(inputs, *place, channels=slice(0, 3))
-        dx, dy = ux * size, uy * size
-    x, y = inputs["x"] - time * dx, inputs["y"] - time * dy
-    ux, uy, size, depth = read(inputs, x, y, channels=slice(0, 4))
-    miss_x, miss_y = ux * size - dx, uy * size - dy
-    miss = (miss_x.square() + miss_y.square() + 1e-12).sqrt() * time.abs()
-    far = (dx.square() + dy.square() + 1e-12).sqrt() * time.abs()
-    allowed = inputs["match_tolerance"] + inputs["match_slope"] * far
-    return _Arrival(x, y, depth, saturate(1 - miss / allowed, options.softness))
-
-
-def _first_color(
-    found: list[_Arrival], weights: list[Tensor], inputs: Inputs, options: TapOptions
-) -> list[tuple[Tensor, Planes]]:
-    """Return the color of the sample with the largest weight: one lookup for all."""
-    x, y, most = found[0].x, found[0].y, weights[0]
-    for one, weight in zip(found[1:], weights[1:], strict=True):
-        larger = weight > most + _TIE
-        x, y = torch.where(larger, one.x, x), torch.where(larger, one.y, y)
-        most = torch.where(larger, weight, most)
-    tap = sample(inputs, x, y, options.color_lookup)
-    return [(_is_visible(tap, inputs, options), _colored(tap, torch.ones_like(most)))]
-
-
-def _mean_color(
-    found: list[_Arrival], weights: list[Tensor], inputs: Inputs, options: TapOptions
-) -> list[tuple[Tensor, Planes]]:
-    """Return the colors of all samples by weights that add up to 1."""
-    total = sum(weights[1:], weights[0])
-    total = torch.where(total > _TINY, total, 1.0)
-    colors = []
-    for one, weight in zip(found, weights, strict=True):
-        tap = sample(inputs, one.x, one.y, options.color_lookup)
-        colors.append((_is_visible(tap, inputs, options), _colored(tap, weight / total)))
-    return colors
-
-
-def _is_visible(tap: Tap, inputs: Inputs, options: TapOptions) -> Tensor:
-    """Return 1 unless the tap lies in front of the pixel, which may hide what it shows."""
-    behind = _classes(inputs["depth"], tap.depth, inputs, options).background
-    return (behind > 0).to(behind.dtype)
-
-
-def _behind(
-    time: Tensor, share: Tensor, inputs: Inputs, options: TapOptions
-) -> tuple[Planes, Tensor, Tensor]:
-    """Return color and weight of the tap on the pixel's own line behind it, and what is hidden."""
-    dx, dy = inputs["half"].split(1, 1)
-    tap = sample(inputs, inputs["x"] - time * dx, inputs["y"] - time * dy, options.color_lookup)
-    behind = _classes(inputs["depth"], tap.depth, inputs, options).background
-    gain = 1.0 if options.fill_hidden else inputs["background_gain"]  # there it comes after
-    *color, weight = _colored(tap, gain * share * behind)
-    return tuple(color), weight, share * (1 - behind)
-
-
-def _colored(tap: Tap, weight: Tensor) -> Planes:
-    """Return a tap's color times a weight, and the weight of it that is valid."""
-    return *weighted(weight, tap.color), weight if tap.valid is None else weight * tap.valid
 
 
 # -- one direction by turns ------------------------------------------------------------------------
@@ -309,15 +181,16 @@ def pair_tap(index: Tensor, count: Tensor, inputs: Inputs, options: TapOptions) 
         parts.append(_sums(tap, _Weights(*(taken * w for w in plain))))
     later, earlier = parts
     return (
-        _added(later[0], earlier[0]),
+        sum_planes(later[0], earlier[0]),
         later[1] + earlier[1],
-        _added(later[2], earlier[2]),
+        sum_planes(later[2], earlier[2]),
         later[3] + earlier[3],
         later[4] + earlier[4],
     )
 
 
-def _added(*parts: Planes) -> Planes:
+def sum_planes(*parts: Planes) -> Planes:
+    """Return the sums of the planes that stand at one place in each part."""
     return tuple(sum(planes[1:], planes[0]) for planes in zip(*parts, strict=True))
 
 
@@ -343,7 +216,9 @@ def _sums(tap: Tap, weights: _Weights) -> Added:
     return colors[0], back, colors[1], front, alpha
 
 
-def _classes(pixel: Tensor, other: Tensor, inputs: Inputs, options: TapOptions) -> DepthWeights:
+def sample_classes(
+    pixel: Tensor, other: Tensor, inputs: Inputs, options: TapOptions
+) -> DepthWeights:
     """Return how far a sample is in front of a pixel, and behind it."""
     classes = depth_weights(
         pixel,
@@ -378,7 +253,7 @@ def _tap(
         moved_p = (inputs["half"] * unit).sum(1, keepdim=True)
         distance_s = (along - options.center * tap.length * toward).abs()
         distance_p = (along - options.center * moved_p).abs()
-    classes = _classes(inputs["depth"], tap.depth, inputs, options)
+    classes = sample_classes(inputs["depth"], tap.depth, inputs, options)
     front = inputs["foreground_gain"] * classes.foreground
     back = inputs["background_gain"] * classes.background
     if options.spread == "ramp":
