@@ -2,7 +2,7 @@
 
 Every mistake is one `ConfigError` with the file and the key path. Paths under `data` are relative
 to `data.root`, which is relative to the file itself; `filter.kind` may be a preset's path, relative
-to the file too.
+to the file too. `data` may be the path of a file that holds this section, for several fits.
 """
 
 from __future__ import annotations
@@ -24,6 +24,7 @@ from tuning.data_config import DataSpec
 from tuning.method_config import BlackBoxMethod, GradientMethod, Method, check_method
 from tuning.objective_config import ObjectiveSpec
 from tuning.overrides import apply_overrides
+from tuning.shared_data import with_shared_data
 
 __all__ = [
     "BlackBoxMethod",
@@ -75,7 +76,7 @@ class FilterSpec(Config):
 
 
 class TuneConfig(Config):
-    """One fit: `torchblur tune CONFIG`."""
+    """One fit: `torchblur tune CONFIG`, where `data` may be the path of a file with that section."""
 
     filter: FilterSpec
     data: DataSpec
@@ -113,8 +114,8 @@ def load_tune_config(path: str | Path, overrides: Sequence[str] = ()) -> TuneCon
         FileFormatError: no such file.
     """
     path = Path(path)
-    data = apply_overrides(load_yaml(path), overrides)
-    config = build(TuneConfig, data, str(path))
+    content = with_shared_data(load_yaml(path), path, overrides)
+    config = build(TuneConfig, content, str(path))
     own_root = any(text.startswith("data.root=") for text in overrides)
     return resolve(config, str(path), path.parent, Path.cwd() if own_root else None)
 
