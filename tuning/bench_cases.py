@@ -46,6 +46,7 @@ class Case(Config):
     )
     batch: int = Field(1, ge=1, description="frames")
     sets: int = Field(1, ge=1, description="parameter sets of one frame")
+    shared: tuple[str, ...] = Field((), description="smooth parameters that all sets have alike")
     apart: bool = Field(False, description="one call for each frame or set, instead of one for all")
     params: dict[str, Any] = Field(default_factory=dict, description="parameters of the filter")
 

@@ -63,7 +63,7 @@ def _copy(case: Case) -> Callable[[], object]:
 def _blur(case: Case) -> Callable[[], object]:
     blur = make_filter(case)
     frame = bench_frame(case)
-    sets = sets_of(blur, case.sets, frame.color) if case.sets > 1 else {}
+    sets = sets_of(blur, case.sets, frame.color, case.shared) if case.sets > 1 else {}
     history = _history(blur, frame)
     if case.apart:
         calls = [
@@ -116,7 +116,9 @@ def _history(blur: BlurFilter, frame: Frame) -> History | None:
 # -- batches, and the same one by one --------------------------------------------------------------
 
 
-def sets_of(blur: BlurFilter, count: int, like: Tensor) -> dict[str, Tensor]:
+def sets_of(
+    blur: BlurFilter, count: int, like: Tensor, shared: Sequence[str] = ()
+) -> dict[str, Tensor]:
     """Return values of all smooth parameters, (count, 1, 1, 1) each.
 
     They lie around the defaults; parameters at 0 or 1, where a filter may leave work out, stay.
@@ -125,12 +127,15 @@ def sets_of(blur: BlurFilter, count: int, like: Tensor) -> dict[str, Tensor]:
         blur: The filter.
         count: Number of sets.
         like: Whose type and device they take.
+        shared: Parameters that stay.
     """
     now = blur.config
     names = [
         name
         for name, spec in declared(blur.config_class).items()
-        if spec.grad == "smooth" and getattr(now, name) not in (0.0, 1.0, *spec.bounds)
+        if spec.grad == "smooth"
+        and name not in shared
+        and getattr(now, name) not in (0.0, 1.0, *spec.bounds)
     ] or ["shutter"]
     sets = {}
     for name in names:

@@ -33,7 +33,7 @@ class TestOnTheCpu:
         assert limits["forward and backward of a fit (all parameters), over forward"] == 4
         assert limits["the same, with the gradient of the color"] == 4
         assert limits["forward and backward, over forward: peak memory"] == 3
-        assert limits["32 parameter sets of one 128x128 frame: 32 calls over one"] == 3
+        assert limits["32 parameter sets of one 128x128 frame, all weights: 32 calls over one"] == 3
 
     def test_judges_planted_figures(self):
         rows = rows_for(cpu_s=2.0, peak_mib=100.0, compile_s=9.0)
@@ -42,7 +42,8 @@ class TestOnTheCpu:
         rows = with_figures(rows, GUERTIN.but(what="backward"), cpu_s=9.0, peak_mib=250.0)
         rows = with_figures(rows, GUERTIN.but(what="parameters"), cpu_s=7.0)
         sets = GUERTIN.but(width=128, height=128, sets=32)
-        rows = with_figures(rows, sets, cpu_s=0.5)
+        rows = with_figures(rows, sets, cpu_s=1.0)
+        rows = with_figures(rows, sets.but(shared=("min_length",)), cpu_s=0.5)
         found = by_name(judge_targets(targets_for("cpu"), rows))
         verdicts = {name: (row.value, row.met) for name, row in found.items()}
         assert verdicts == {
@@ -56,13 +57,14 @@ class TestOnTheCpu:
             "the same, with the gradient of the color": (4.5, False),
             "forward and backward, over forward: peak memory": (2.5, True),
             "backward, 1280x720, N = 35 over N = 5: peak memory": (1.0, True),
-            "32 parameter sets of one 128x128 frame: 32 calls over one": (4.0, True),
+            "32 parameter sets of one 128x128 frame, all weights: 32 calls over one": (4.0, True),
+            "the same, min_length too, which moves the taps": (2.0, False),
         }
 
     def test_larger_is_better_where_it_says_so(self):
         rows = rows_for(cpu_s=2.0)
         found = by_name(judge_targets(targets_for("cpu"), rows))
-        sets = found["32 parameter sets of one 128x128 frame: 32 calls over one"]
+        sets = found["32 parameter sets of one 128x128 frame, all weights: 32 calls over one"]
         assert (sets.value, sets.met, sets.at_least) == (1.0, False, True)
 
     def test_does_not_judge_what_failed(self):

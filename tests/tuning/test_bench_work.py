@@ -120,6 +120,8 @@ class TestSets:
         for name, values in sets.items():
             assert values.shape == (5, 1, 1, 1)
             assert float(values[2]) == pytest.approx(getattr(blur.config, name))
+        fewer = sets_of(blur, 5, torch.zeros(1), shared=("kappa",))
+        assert set(sets) - set(fewer) == {"kappa"}
 
     def test_are_of_the_shutter_if_there_is_nothing_else(self):
         assert list(sets_of(get_filter("line")(), 3, torch.zeros(1))) == ["shutter"]
