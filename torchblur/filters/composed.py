@@ -17,6 +17,7 @@ from torchblur.filters.guertin2014 import center_direction
 from torchblur.filters.moving import packed_values
 from torchblur.filters.notes2025_gather import Blurred, Line, Sums, compose
 from torchblur.filters.notes2025_postfilter import post_filter
+from torchblur.filters.places import SHORTEST_REACH, num_pairs
 from torchblur.filters.reconstruction import resolve, texture_of
 from torchblur.filters.revealed import revealed_inputs
 from torchblur.filters.spreads import Spread
@@ -27,7 +28,6 @@ from torchblur.ops.velocity import direction, length
 from torchblur.ops.weights import power, saturate
 
 __all__ = ["ComposedBlur", "ComposedConfig", "composed"]
-_SHORTEST_REACH = 1e-3  # px; what is shorter has no direction either
 _TRACE = 1e-6  # weight per tap
 
 
@@ -193,7 +193,7 @@ def _lines(
     ways: dict[str, _Way], linear: Tensor, moving: Tensor, values: Values
 ) -> dict[str, Line]:
     """Return where each direction is sampled, and how densely if in pairs."""
-    pairs = (values.num_samples + 1) // 2
+    pairs = num_pairs(values)
     lines = {}
     if len(ways) > 1:
         ways = {name: way for name, way in ways.items() if name != "reversed"}
@@ -222,7 +222,7 @@ def _gather(
     if values.sampling == "pairs":
         found = []
         for name, line in lines.items():
-            reach = ways[name].reach.clamp_min(_SHORTEST_REACH)
+            reach = ways[name].reach.clamp_min(SHORTEST_REACH)
             inputs = shared | ways[name]._asdict() | {"reach": reach, "pairs": line.pairs}
             totals = gather_lists(pair_tap, options, line.most_pairs, inputs, pixels, engine)
             area = values.area_slope * reach if values.accurate_alpha else None

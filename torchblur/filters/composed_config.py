@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Annotated, Literal
 
+from torchblur.filters.places import PairNoise
 from torchblur.filters.reconstruction import ColorLookup, ReconstructionConfig
 from torchblur.filters.revealed import RevealedBackgroundConfig
 from torchblur.ops.directions import DirectionReduction
@@ -80,7 +81,7 @@ class ComposedConfig(RevealedBackgroundConfig, ReconstructionConfig):
         low=0.0, high=1.0, grad="weak", source=_OURS,
         meaning="how much nearer, as a share of the depth, a pixel beside must be for that",
     )] = 0.0
-    noise: Annotated[Literal["checkerboard", "gradient", "halton", "none"], Param(
+    noise: Annotated[PairNoise, Param(
         grad="discrete", source=f"halton: {_GUERTIN}; checkerboard: {_JIMENEZ}",
         meaning="shift of a pixel's taps: 2x2 dither, interleaved gradient noise, Halton",
     )] = "none"  # type: ignore[assignment]  # more than the base has

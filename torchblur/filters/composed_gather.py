@@ -8,11 +8,18 @@ import torch
 from torch import Tensor
 
 from torchblur.filters.base import Values
-from torchblur.filters.reconstruction import TEXTURE_COLOR, ColorLookup, Tap, is_one, sample
+from torchblur.filters.places import tap_shift
+from torchblur.filters.reconstruction import (
+    TEXTURE_COLOR,
+    WEIGHT_PARAMETERS,
+    ColorLookup,
+    Tap,
+    is_one,
+    sample,
+)
 from torchblur.frame import Frame, Shutter
 from torchblur.ops.cubic import second_differences
 from torchblur.ops.gather import Inputs, Planes, weighted
-from torchblur.ops.noise import dither_2x2, noise_plane
 from torchblur.ops.pixels import PixelList
 from torchblur.ops.spread import Mirror, SpreadForm, TapPair, mirror, spread_weight
 from torchblur.ops.weights import DepthWeights, cone, cylinder, depth_weights, power, saturate
@@ -31,15 +38,7 @@ __all__ = [
 
 _TINY = 1e-6
 TAP_PARAMETERS = (
-    "cone_slope",
-    "cone_exponent",
-    "cylinder_inner",
-    "cylinder_outer",
-    "foreground_gain",
-    "background_gain",
-    "third_gain",
-    "depth_level",
-    "min_length",
+    *WEIGHT_PARAMETERS,
     "spread_offset",
     "spread_slope",
     "direction_exponent",
@@ -119,16 +118,12 @@ def shared_inputs(frame: Frame, texture: Tensor, pixels: PixelList, values: Valu
         values: The parameters, those per pixel as lists.
     """
     x, y = pixels.grid(frame.color)
-    if values.noise == "checkerboard":
-        shift = dither_2x2(frame.color, pixels)
-    else:
-        shift = noise_plane(values.noise, frame.color, 0, values.seed, pixels) - 0.5
     relative = values.depth_compare == "relative"
     inputs = {
         "texture": texture,
         "x": x,
         "y": y,
-        "shift": shift * values.jitter,
+        "shift": tap_shift(frame.color, values, pixels),
         "depth": frame.finite_depth(),
         "extent": values.relative_depth_extent if relative else values.soft_depth_extent,
     }

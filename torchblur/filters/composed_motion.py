@@ -8,20 +8,14 @@ from torch import Tensor
 
 from torchblur.filters.base import Values
 from torchblur.filters.moving import moving_tiles
-from torchblur.filters.spreads import Spread, longest_spread
+from torchblur.filters.places import tile_noise
+from torchblur.filters.spreads import Spread, exact_spread, longest_spread, tile_motions
 from torchblur.frame import Frame
-from torchblur.ops.directions import TileDirections, tile_directions
-from torchblur.ops.noise import NoiseKind, noise_plane
+from torchblur.ops.directions import TileDirections
+from torchblur.ops.noise import noise_plane
 from torchblur.ops.pixels import PixelList
-from torchblur.ops.tiles import (
-    neighbor_max,
-    neighbor_min,
-    tile_lookup,
-    tile_max,
-    tile_min,
-    tile_offset,
-)
-from torchblur.ops.velocity import clamp_length, direction, half_velocity, length, quantize_uint8
+from torchblur.ops.tiles import neighbor_min, tile_lookup, tile_min, tile_offset
+from torchblur.ops.velocity import clamp_length, half_velocity, quantize_uint8
 
 __all__ = ["clean_edges", "half_spreads", "moving_pixels", "tile_planes"]
 
@@ -65,28 +59,12 @@ def half_spreads(frame: Frame, values: Values) -> tuple[Spread, TileDirections]:
     half = clamp_length(whole, longest)
     if values.velocity_encoding == "uint8":
         whole = half = quantize_uint8(half, size)
-    if values.second_direction:
-        tiles = tile_directions(
-            whole,
-            size,
-            reduction=values.direction_reduction,
-            cull=values.neighbor_culling,
-            exponent=_per_image(values.secondary_exponent),
-        )
-    else:
-        primary = neighbor_max(tile_max(whole, size), cull=values.neighbor_culling)
-        tiles = TileDirections(primary, torch.zeros_like(primary))
+    tiles = tile_motions(whole, values, two=values.second_direction)
     if values.velocity_encoding != "uint8":
         tiles = TileDirections(*(clamp_length(tile, longest) for tile in tiles))
     if values.velocity_encoding == "tiles":
         tiles = TileDirections(*(quantize_uint8(tile, size) for tile in tiles))
-    unit = direction(half)
-    return Spread(half, torch.where((unit == 0).all(1, True), 0.0, length(half)), unit), tiles
-
-
-def _per_image(value: Tensor) -> Tensor:
-    """Return a parameter without its dependence on the pixel, for use per tile."""
-    return value.mean((-2, -1), keepdim=True) if value.ndim == 4 else value
+    return exact_spread(half), tiles
 
 
 def moving_pixels(frame: Frame, tiles: TileDirections, values: Values) -> PixelList:
@@ -110,8 +88,7 @@ def tile_planes(
         values: The parameters.
     """
     edge = values.tile_size
-    kind: NoiseKind = "gradient" if values.noise == "checkerboard" else values.noise
-    noise = noise_plane(kind, color, 1, values.seed, pixels)
+    noise = noise_plane(tile_noise(values), color, 1, values.seed, pixels)
     offset = tile_offset(color, noise, edge, pixels.pack(values.tile_jitter), pixels)
     least = neighbor_min(tile_min(size.detach(), edge))
     return [tile_lookup(t, color, edge, offset, pixels=pixels) for t in (*tiles, least)]

@@ -11,7 +11,7 @@ from torchblur.filters.base import BlurFilter, Values
 from torchblur.filters.guertin2014_config import Guertin2014Config
 from torchblur.filters.moving import Filtered, Moving, Stray, moving_part, revealed_part
 from torchblur.filters.reconstruction import WEIGHT_PARAMETERS, Tap, is_one, resolve, sample
-from torchblur.filters.spreads import Spread, tiles_of
+from torchblur.filters.spreads import Spread, per_image, tiles_of
 from torchblur.frame import Frame, Shutter
 from torchblur.ops.color import luma
 from torchblur.ops.gather import Engine, Inputs, Lookup, Planes, gather_lists, weighted
@@ -103,7 +103,7 @@ def _filtered(frame: Frame, values: Values, engine: Engine) -> Filtered:
     own, around = tiles_of(frame, values, uint8=uint8, cull=values.neighbor_culling)
     tiles = {"tile_max": own, "neighbor_max": around}
     if values.sample_assignment == "variance":
-        tiles["tile_variance"] = tile_variance(own, _per_image(values.min_length))
+        tiles["tile_variance"] = tile_variance(own, per_image(values.min_length))
     stray = Stray(values.noise, values.tau) if values.stochastic_tiles else None
     part = moving_part(frame, values, around, stray=stray, uint8=uint8)
     if part is None:
@@ -201,11 +201,6 @@ def center_direction(w_n: Tensor, spread: Spread, length_p: Tensor, values: Valu
     mixed = (1 - mix) * w_p + mix * spread.unit
     size = length(mixed)
     return torch.where(size < 1e-6, w_p, mixed / size)
-
-
-def _per_image(value: Tensor) -> Tensor:
-    """Return a parameter without its dependence on the pixel, for use per tile."""
-    return value.mean((-2, -1), keepdim=True) if value.ndim == 4 else value
 
 
 def _luma(frame: Frame, moving: Tensor, kind: str, color: Tensor) -> Tensor:

@@ -10,19 +10,17 @@ from torch import Tensor
 from torchblur.filters.base import BlurFilter, Values
 from torchblur.filters.jimenez2014_config import Jimenez2014Config
 from torchblur.filters.moving import Filtered, Moving, Stray, moving_part, revealed_part
+from torchblur.filters.places import SHORTEST_REACH, num_pairs, tap_shift, tile_noise
 from torchblur.filters.reconstruction import Tap, sample
 from torchblur.filters.spreads import pixel_spread, tiles_of
 from torchblur.frame import Frame, Shutter
 from torchblur.ops.gather import Engine, Inputs, Lookup, Planes, gather_lists, weighted
-from torchblur.ops.noise import NoiseKind, dither_2x2, noise_plane
 from torchblur.ops.pixels import select, takes_all_pixels
 from torchblur.ops.spread import Mirror, SpreadForm, TapPair, depth_shares, mirror, spread_weight
 from torchblur.ops.tiles import neighbor_min, tile_lookup, tile_min
 from torchblur.ops.velocity import direction, length, quantize_uint8
 
 __all__ = ["Jimenez2014Blur", "Jimenez2014Config", "jimenez2014"]
-
-_SHORTEST_REACH = 1e-3  # px; what is shorter has no direction either
 
 
 class _Options(NamedTuple):
@@ -98,8 +96,7 @@ def _filtered(frame: Frame, values: Values, engine: Engine) -> Filtered:
         own, around = (quantize_uint8(tile, values.tile_size) for tile in (own, around))
     shortest = neighbor_min(tile_min(pixel_spread(frame, values).length, values.tile_size))
     tiles = {"tile_max": own, "neighbor_max": around, "tile_min": shortest}
-    kind: NoiseKind = "gradient" if values.noise == "checkerboard" else values.noise
-    part = moving_part(frame, values, around, stray=Stray(kind, values.tile_jitter))
+    part = moving_part(frame, values, around, stray=Stray(tile_noise(values), values.tile_jitter))
     if part is None:
         return Filtered.still(frame, tiles, "alpha", "tile_class")
     inputs, tile_class = _tap_inputs(part, shortest)
@@ -114,7 +111,7 @@ def _filtered(frame: Frame, values: Values, engine: Engine) -> Filtered:
         values.softness,
         values.color_lookup,
     )
-    pairs = (values.num_samples + 1) // 2
+    pairs = num_pairs(values)
     sums = _sums(part, tile_class, options, pairs, inputs, engine)
     color, alpha = (total / (2 * pairs) for total in sums)
     lists = {
@@ -183,17 +180,13 @@ def _tap_inputs(part: Moving, shortest: Tensor) -> tuple[Inputs, Tensor]:
     reach = length(part.dominant)
     tile_class = _tile_class(reach, least, values)
     x, y = part.grid()
-    if values.noise == "checkerboard":
-        shift = dither_2x2(color, pixels)
-    else:
-        shift = noise_plane(values.noise, color, 0, values.seed, pixels) - 0.5
     inputs = {
         "texture": part.texture,
         "x": x,
         "y": y,
-        "shift": shift * values.jitter,
+        "shift": tap_shift(color, values, pixels),
         "direction": direction(part.dominant),
-        "reach": reach.clamp_min(_SHORTEST_REACH),
+        "reach": reach.clamp_min(SHORTEST_REACH),
         "depth": part.frame.finite_depth(),
         "half": part.spread.half,
         "length": part.spread.length,

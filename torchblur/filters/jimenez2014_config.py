@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Annotated, Literal
 
+from torchblur.filters.places import PairNoise
 from torchblur.filters.revealed import RevealedBackgroundConfig
 from torchblur.ops.gather import Lookup
 from torchblur.ops.spread import Mirror, SpreadForm
@@ -67,7 +68,7 @@ class Jimenez2014Config(RevealedBackgroundConfig):
               meaning="give both taps of a pair the weight of the nearer and faster one"),
     ] = "ports"
     noise: Annotated[
-        Literal["checkerboard", "gradient", "halton", "none"],
+        PairNoise,
         Param(grad="discrete", source="Jimenez 2014; gradient: Unity HDRP, Blender",
               meaning="shift of a pixel's taps: 2x2 dither, interleaved gradient noise, Halton"),
     ] = "checkerboard"

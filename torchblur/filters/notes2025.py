@@ -20,15 +20,16 @@ from torchblur.filters.notes2025_gather import (
     shared_inputs,
 )
 from torchblur.filters.notes2025_postfilter import post_filter
+from torchblur.filters.places import num_pairs, tile_noise
 from torchblur.filters.revealed import layer_behind, revealed_inputs
-from torchblur.filters.spreads import Spread
-from torchblur.frame import Frame, Shutter
-from torchblur.ops.directions import TileDirections, tile_directions
+from torchblur.filters.spreads import Spread, exact_spread, longest_spread, tile_motions
+from torchblur.frame import Frame
+from torchblur.ops.directions import TileDirections
 from torchblur.ops.gather import Engine
-from torchblur.ops.noise import NoiseKind, noise_plane
+from torchblur.ops.noise import noise_plane
 from torchblur.ops.pixels import PixelList
 from torchblur.ops.resample import HalfImage, UpsampleRules, box_halve, depth_halve, upsample_over
-from torchblur.ops.tiles import neighbor_max, neighbor_min, tile_lookup, tile_max, tile_min
+from torchblur.ops.tiles import neighbor_min, tile_lookup, tile_min
 from torchblur.ops.tiles import tile_offset as offset_of_tiles
 from torchblur.ops.velocity import clamp_length, direction, half_velocity, length, quantize_uint8
 from torchblur.params import declared
@@ -137,43 +138,25 @@ def _motion(frame: Frame, values: Values) -> tuple[Spread, TileDirections, Tenso
     rounding would choose among them.
     """
     size = values.tile_size
-    longest = size / (1 + abs(Shutter(1, values.shutter_position).center))
+    longest = longest_spread(values)
     whole = half_velocity(frame.velocity, values.shutter)
     half = clamp_length(whole, longest)
     if values.velocity_encoding == "uint8":
         whole = half = quantize_uint8(half, size)
-    if values.directions == "one":
-        primary = neighbor_max(tile_max(whole, size), cull=values.neighbor_culling)
-        tiles = TileDirections(primary, torch.zeros_like(primary))
-    else:
-        tiles = tile_directions(
-            whole,
-            size,
-            reduction=values.direction_reduction,
-            cull=values.neighbor_culling,
-            exponent=_per_image(values.secondary_exponent),
-        )
+    tiles = tile_motions(whole, values, two=values.directions == "two")
     tiles = TileDirections(*(clamp_length(tile, longest) for tile in tiles))
-    # Exactly 0 where still: a still pixel must not count, however little.
-    unit = direction(half)
-    spread = Spread(half, torch.where((unit == 0).all(1, True), 0.0, length(half)), unit)
+    spread = exact_spread(half)
     return spread, tiles, neighbor_min(tile_min(spread.length.detach(), size))
 
 
-def _per_image(value: Tensor) -> Tensor:
-    """Return a parameter without its dependence on the pixel, for use per tile."""
-    return value.mean((-2, -1), keepdim=True) if value.ndim == 4 else value
-
-
 def _tile_shift(color: Tensor, values: Values) -> Tensor:
-    kind: NoiseKind = "gradient" if values.noise == "checkerboard" else values.noise
-    noise = noise_plane(kind, color, 1, values.seed)
+    noise = noise_plane(tile_noise(values), color, 1, values.seed)
     return offset_of_tiles(color, noise, values.tile_size, values.tile_jitter)
 
 
 def _lines(first: Tensor, second: Tensor, linear: Tensor, values: Values) -> list[Line]:
     """Return the directions that are sampled, and how densely."""
-    pairs = (values.num_samples + 1) // 2
+    pairs = num_pairs(values)
     plane = torch.full_like(first[:, :1], float(pairs))
     moving = length(first) > values.early_out
     doubled = torch.where(linear, plane, 2 * plane) if values.double_samples else plane

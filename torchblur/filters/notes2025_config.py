@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Annotated, Literal
 
+from torchblur.filters.places import PairNoise
 from torchblur.filters.revealed import RevealedBackgroundConfig
 from torchblur.ops.directions import DirectionReduction
 from torchblur.ops.spread import Mirror, SpreadForm
@@ -39,7 +40,7 @@ class Notes2025Config(RevealedBackgroundConfig):
         symbol="r", unit="px", low=1, high=512, scale="log", grad="discrete", source=_BASE,
         meaning="edge of a tile, and the longest half spread that is blurred (full resolution)",
     )] = 32
-    noise: Annotated[Literal["checkerboard", "gradient", "halton", "none"], Param(
+    noise: Annotated[PairNoise, Param(
         grad="discrete", source=_BASE,
         meaning="shift of a pixel's taps: 2x2 dither, interleaved gradient noise, Halton",
     )] = "checkerboard"

@@ -8,11 +8,11 @@ import torch
 from torch import Tensor
 
 from torchblur.filters.base import Values
+from torchblur.filters.places import SHORTEST_REACH, num_pairs, tap_shift
 from torchblur.filters.reconstruction import ColorLookup, Tap, sample, texture_of
 from torchblur.filters.spreads import Spread
 from torchblur.frame import Frame, Shutter
 from torchblur.ops.gather import Engine, Inputs, Planes, gather, pixel_grid, weighted
-from torchblur.ops.noise import dither_2x2, noise_plane
 from torchblur.ops.pixels import PixelList
 from torchblur.ops.spread import Mirror, SpreadForm, TapPair, depth_shares, mirror, spread_weight
 from torchblur.ops.velocity import direction, length
@@ -28,7 +28,6 @@ __all__ = [
     "shared_inputs",
 ]
 
-_SHORTEST_REACH = 1e-3  # px; what is shorter has no direction either
 SHARED_PARAMETERS = (
     "depth_range",
     "relative_depth_range",
@@ -105,16 +104,12 @@ def shared_inputs(frame: Frame, spread: Spread, linear: Tensor, values: Values) 
         values: The parameters.
     """
     x, y = pixel_grid(frame.color)
-    if values.noise == "checkerboard":
-        shift = dither_2x2(frame.color)
-    else:
-        shift = noise_plane(values.noise, frame.color, 0, values.seed) - 0.5
     relative = values.depth_compare == "relative"
     inputs = {
         "texture": texture_of(frame, spread),
         "x": x,
         "y": y,
-        "shift": shift * values.jitter,
+        "shift": tap_shift(frame.color, values),
         "depth": frame.finite_depth(),
         "half": spread.half,
         "unit": spread.unit,
@@ -137,7 +132,7 @@ def gather_line(
         engine: Of the gather.
         active: The pixels where anything moves.
     """
-    reach = length(line.vector).clamp_min(_SHORTEST_REACH)
+    reach = length(line.vector).clamp_min(SHORTEST_REACH)
     unit = direction(line.vector)
     own = (shared["unit"] * unit).sum(1, keepdim=True).abs()
     inputs = shared | {
@@ -284,7 +279,7 @@ def _separate(
     has_foreground = total.foreground > 0
     foreground = total.foreground_color / torch.where(has_foreground, total.foreground, 1.0)
     alpha = torch.where(has_foreground, alpha, 0.0)
-    center = values.center_weight / (2 * _num_pairs(values))
+    center = values.center_weight / (2 * num_pairs(values))
     if frame.valid is not None:
         center = center * frame.valid.to(frame.dtype)
     weight = total.background + center
@@ -312,7 +307,3 @@ def _combined(frame: Frame, total: Sums, alpha: Tensor) -> tuple[Tensor, Tensor,
         share = torch.where(frame.valid | ~some, alpha, 1.0)
     color = share * blurred + (1 - share) * frame.color
     return color, alpha, alpha
-
-
-def _num_pairs(values: Values) -> int:
-    return int(values.num_samples + 1) // 2

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from torchblur.filters.base import Values
 from torchblur.filters.notes2025_gather import Blurred, Line
+from torchblur.filters.places import num_pairs
 from torchblur.frame import Frame
 from torchblur.ops.gather import Engine, Inputs, Planes, gather, pixel_grid, read, weighted
 from torchblur.ops.pixels import PixelList
@@ -74,7 +75,7 @@ def _inputs(frame: Frame, image: Blurred, values: Values) -> Inputs:
     usable = torch.ones_like(alpha)
     if frame.valid is not None:
         usable = (frame.valid | (image.weight > 0)).to(frame.dtype)
-    step = 1 / ((values.num_samples + 1) // 2)
+    step = 1 / num_pairs(values)
     return {
         "texture": torch.cat(_alike(image.color, alpha, image.output_alpha, usable), 1),
         "x": x,
@@ -96,7 +97,7 @@ def _along(
     line: Line, shared: Inputs, options: _Options, values: Values, engine: Engine
 ) -> tuple[Tensor, ...]:
     """Return color and weight of the samples along a line, inside and at an edge, and the peak."""
-    gap = length(line.vector) / ((values.num_samples + 1) // 2)
+    gap = length(line.vector) / num_pairs(values)
     most = max(values.post_samples // 2, 1)
     inputs = shared | {
         "unit": direction(line.vector),

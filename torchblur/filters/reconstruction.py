@@ -233,7 +233,7 @@ WEIGHT_PARAMETERS = (
     "depth_level",
     "min_length",
 )
-"""Parameters that the taps of both filters take as they are."""
+"""Parameters that the taps take as they are."""
 
 
 def is_one(value: Tensor) -> bool:

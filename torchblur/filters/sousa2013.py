@@ -16,7 +16,7 @@ from torchblur.filters.reconstruction import (
     sample,
     texture_of,
 )
-from torchblur.filters.spreads import Spread, Tiles, spread_of
+from torchblur.filters.spreads import Spread, Tiles, longest_spread, spread_of
 from torchblur.frame import Frame, Shutter
 from torchblur.ops.gather import Engine, Inputs, Lookup, Planes, gather, pixel_grid, weighted
 from torchblur.ops.noise import NoiseKind, noise_plane
@@ -174,7 +174,7 @@ def _layers(frame: Frame, values: Values, engine: Engine) -> dict[str, Tensor]:
 def _spread(frame: Frame, values: Values) -> tuple[Spread, Tiles]:
     if values.encoding == "float":
         return spread_of(frame, values)
-    longest = values.tile_size / (1 + abs(Shutter(1, values.shutter_position).center))
+    longest = longest_spread(values)
     half = clamp_length(half_velocity(frame.velocity, values.shutter), longest)
     half = quantize_gamma2(half, longest)
     tiles = tile_max(half, values.tile_size)

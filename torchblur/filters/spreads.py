@@ -4,14 +4,26 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+import torch
 from torch import Tensor
 
 from torchblur.filters.base import Values
 from torchblur.frame import Frame, Shutter
+from torchblur.ops.directions import TileDirections, tile_directions
 from torchblur.ops.tiles import neighbor_max, tile_max
 from torchblur.ops.velocity import clamp_length, direction, half_velocity, length, quantize_uint8
 
-__all__ = ["Spread", "Tiles", "longest_spread", "pixel_spread", "spread_of", "tiles_of"]
+__all__ = [
+    "Spread",
+    "Tiles",
+    "exact_spread",
+    "longest_spread",
+    "per_image",
+    "pixel_spread",
+    "spread_of",
+    "tile_motions",
+    "tiles_of",
+]
 
 
 class Spread(NamedTuple):
@@ -90,3 +102,41 @@ def tiles_of(frame: Frame, values: Values, *, uint8: bool = False, cull: bool = 
     longest = longest_spread(values)
     around = neighbor_max(tiles, cull=cull)
     return Tiles(clamp_length(tiles, longest), clamp_length(around, longest))
+
+
+def exact_spread(half: Tensor) -> Spread:
+    """Return half spreads with lengths of exactly 0 where still.
+
+    A still pixel must not count, however little.
+
+    Args:
+        half: In px, (B, 2, H, W).
+    """
+    unit = direction(half)
+    return Spread(half, torch.where((unit == 0).all(1, True), 0.0, length(half)), unit)
+
+
+def tile_motions(half: Tensor, values: Values, *, two: bool) -> TileDirections:
+    """Return the longest half spread around each tile, and one that differs from it.
+
+    Args:
+        half: Half spreads of the pixels, px, (B, 2, H, W).
+        values: `tile_size`, `neighbor_culling`; `direction_reduction`, `secondary_exponent`.
+        two: Whether the second is wanted; else it is 0.
+    """
+    size, cull = values.tile_size, values.neighbor_culling
+    if two:
+        return tile_directions(
+            half,
+            size,
+            reduction=values.direction_reduction,
+            cull=cull,
+            exponent=per_image(values.secondary_exponent),
+        )
+    primary = neighbor_max(tile_max(half, size), cull=cull)
+    return TileDirections(primary, torch.zeros_like(primary))
+
+
+def per_image(value: Tensor) -> Tensor:
+    """Return a parameter without its dependence on the pixel, for use per tile."""
+    return value.mean((-2, -1), keepdim=True) if value.ndim == 4 else value
