@@ -90,7 +90,7 @@ class _Search:
             if pruning is None
             else Ladder(problem, pruning, seed_of(job.seed, job.index, _WINDOWS_SEED))
         )
-        rungs = 1 if self.ladder is None else len(self.ladder.sizes)
+        rungs = 1 if self.ladder is None else len(self.ladder.rungs)
         self.study = new_study(make_pruner(job.method, rungs))
 
     @property
@@ -144,7 +144,9 @@ class _Search:
         if self.ladder is not None:
             return self.ladder.climb(trials, space, fixed, candidates, together)
         found = evaluate_candidates(self.problem, space, fixed, candidates, together=together)
-        return [Climb(loss=float(one.losses), cpu_seconds=one.cpu_seconds) for one in found]
+        return [
+            Climb(loss=float(one.losses), passes=1.0, cpu_seconds=one.cpu_seconds) for one in found
+        ]
 
     def _known_losses(self) -> list[float]:
         trials = self.study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,))
@@ -171,9 +173,7 @@ class _Search:
         return [by_number.get(trial.number) for trial in trials]
 
     def _tell(self, trial: Trial, climb: Climb, after: Polished | None) -> FrozenTrial:
-        total = len(self.problem.samples) if self.ladder is not None else 1
-        passes = climb.windows / total if self.ladder is not None else 1.0
-        evaluations, seconds = 1, climb.cpu_seconds
+        passes, evaluations, seconds = climb.passes, 1, climb.cpu_seconds
         if after is not None and not _is_new(after, trial):  # no trial of its own has its cost
             passes += _passes(after, self.job, self.problem)
             evaluations += after.evaluations

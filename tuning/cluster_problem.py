@@ -40,11 +40,13 @@ class _Order:
         config: The resolved configuration as JSON.
         windows: Fingerprint of the driver's windows.
         chosen: Positions of the windows that count; all if None.
+        crop: Edge of the part of each of them that counts; all of it if None.
     """
 
     config: str
     windows: tuple[tuple[int, int, float], ...]
     chosen: tuple[int, ...] | None = None
+    crop: float | None = None
 
     @property
     def key(self) -> str:
@@ -60,6 +62,7 @@ class ClusterProblem(Problem):
         config: The resolved configuration that it was made of.
         problem: The objective.
         chosen: Positions of the windows that count; all if left out.
+        crop: As `Problem.subset` takes it.
     """
 
     def __init__(
@@ -68,21 +71,24 @@ class ClusterProblem(Problem):
         config: TuneConfig,
         problem: Problem,
         chosen: Sequence[int] | None = None,
+        crop: float | None = None,
     ) -> None:
-        samples = problem.samples if chosen is None else [problem.samples[i] for i in chosen]
-        super().__init__(problem.blur, samples, problem.objective, problem.free)
+        part = problem if chosen is None else problem.subset(chosen, crop)
+        super().__init__(problem.blur, part.samples, problem.objective, problem.free)
         self._config, self._whole, self._cluster = config, problem, cluster
         self._order = _Order(
             config=json.dumps(config.model_dump(mode="json"), sort_keys=True),
             windows=fingerprint(problem),
             chosen=None if chosen is None else tuple(chosen),
+            crop=crop,
         )
 
-    def subset(self, chosen: Sequence[int]) -> ClusterProblem:
+    def subset(self, chosen: Sequence[int], crop: float | None = None) -> ClusterProblem:
         """Return the objective of some of the windows, on the same workers."""
+        assert self._order.crop is None  # a part has no parts
         known = self._order.chosen
         positions = chosen if known is None else [known[i] for i in chosen]
-        return ClusterProblem(self._cluster, self._config, self._whole, positions)
+        return ClusterProblem(self._cluster, self._config, self._whole, positions, crop)
 
     def map(self, function: Callable[[Problem, T], R], items: Sequence[T]) -> list[R]:
         """Return `function(problem, item)` for each item, in order; workers call it.
@@ -96,7 +102,8 @@ class ClusterProblem(Problem):
 # -- on a worker -------------------------------------------------------------------------------
 
 
-_BUILT: OrderedDict[str, dict[tuple[int, ...] | None, Problem]] = OrderedDict()
+_Part = tuple[tuple[int, ...] | None, float | None]  # positions of windows, edge of each part
+_BUILT: OrderedDict[str, dict[_Part, Problem]] = OrderedDict()
 _BUILDING, _COMPILED = threading.Lock(), threading.Lock()
 
 
@@ -112,13 +119,14 @@ def _problem_of(order: _Order) -> Problem:
     with _BUILDING:
         found = _BUILT.get(order.key)
         if found is None:
-            found = _BUILT[order.key] = {None: _build(order)}
+            found = _BUILT[order.key] = {(None, None): _build(order)}
         _BUILT.move_to_end(order.key)
         while len(_BUILT) > _KEPT:
             _BUILT.popitem(last=False)
-        if order.chosen is not None and order.chosen not in found:
-            found[order.chosen] = found[None].subset(order.chosen)
-        return found[order.chosen]
+        part = (order.chosen, order.crop)
+        if order.chosen is not None and part not in found:
+            found[part] = found[None, None].subset(order.chosen, order.crop)
+        return found[part]
 
 
 def _build(order: _Order) -> Problem:

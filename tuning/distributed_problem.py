@@ -28,6 +28,7 @@ class Request:
         slopes: Names of the values whose gradient is wanted.
         weights: Of each window for each set, (n, K); None for the mean.
         unroll: As `Problem.losses` takes it.
+        crop: As `Problem.subset` takes it.
     """
 
     kind: Literal["sum", "each"]
@@ -38,6 +39,7 @@ class Request:
     slopes: tuple[str, ...] = ()
     weights: Tensor | None = None
     unroll: int | None = None
+    crop: float | None = None
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -67,7 +69,7 @@ class Shard:
         objective = problem.objective.model_copy(update={"cost": 0.0})
         self._problem = Problem(problem.blur, problem.samples, objective, problem.free)
         self._rank, self._count = rank, count
-        self._subsets: dict[tuple[int, ...], Problem] = {}
+        self._subsets: dict[tuple[tuple[int, ...], float | None], Problem] = {}
 
     def answer(self, request: Request) -> Tensor:
         """Return this rank's part of the sum that answers a request, float64, on the CPU."""
@@ -98,14 +100,15 @@ class Shard:
 
     def _windows(
         self, request: Request, places: Sequence[int]
-    ) -> tuple[Problem, tuple[int, ...] | None]:
+    ) -> tuple[Problem, Sequence[int] | None]:
         """Return what is asked, and of which windows: those that come again are joined."""
         mine = tuple(request.positions[place] for place in places)
-        if request.count > 1 or not request.is_whole:
+        if request.crop is None and (request.count > 1 or not request.is_whole):
             return self._problem, mine
-        if mine not in self._subsets:
-            self._subsets[mine] = self._problem.subset(mine)
-        return self._subsets[mine], None
+        if (mine, request.crop) not in self._subsets:
+            self._subsets[mine, request.crop] = self._problem.subset(mine, request.crop)
+        windows = None if request.count == 1 else range(len(mine))
+        return self._subsets[mine, request.crop], windows
 
 
 class ShardedProblem(Problem):
@@ -118,17 +121,26 @@ class ShardedProblem(Problem):
         problem: The objective, with all windows.
         crew: The ranks.
         chosen: Positions of the windows that count; all if left out.
+        crop: As `Problem.subset` takes it.
     """
 
-    def __init__(self, problem: Problem, crew: Crew, chosen: Sequence[int] | None = None) -> None:
+    def __init__(
+        self,
+        problem: Problem,
+        crew: Crew,
+        chosen: Sequence[int] | None = None,
+        crop: float | None = None,
+    ) -> None:
         self._positions = tuple(range(len(problem.samples)) if chosen is None else chosen)
-        samples = [problem.samples[i] for i in self._positions]
+        samples = problem.subset(self._positions, crop).samples
         super().__init__(problem.blur, samples, problem.objective, problem.free)
-        self._whole, self._crew = problem, crew
+        self._whole, self._crew, self._crop = problem, crew, crop
 
-    def subset(self, chosen: Sequence[int]) -> ShardedProblem:
+    def subset(self, chosen: Sequence[int], crop: float | None = None) -> ShardedProblem:
         """Return the objective of some of the windows, split between the same ranks."""
-        return ShardedProblem(self._whole, self._crew, [self._positions[i] for i in chosen])
+        assert self._crop is None  # a part has no parts
+        positions = [self._positions[i] for i in chosen]
+        return ShardedProblem(self._whole, self._crew, positions, crop)
 
     def weighted(
         self,
@@ -179,6 +191,7 @@ class ShardedProblem(Problem):
             count=count,
             positions=positions if chosen is None else tuple(positions[i] for i in chosen),
             is_whole=chosen is None,
+            crop=self._crop,
             **more,
         )
 

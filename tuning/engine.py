@@ -18,8 +18,8 @@ from tuning.config import TuneConfig
 from tuning.method_config import GradientMethod, Method, ParetoMethod
 from tuning.outputs import Job
 from tuning.problem import Problem
+from tuning.smaller import pixels_of
 from tuning.space import Space
-from tuning.windows import AnySample, Sample
 
 __all__ = ["files_engine", "fit_engine"]
 
@@ -35,7 +35,7 @@ def fit_engine(config: TuneConfig, problem: Problem, space: Space) -> Engine:
         problem: Its filter and its windows.
         space: Its free parameters.
     """
-    pixels = sum(_pixels(sample) for sample in problem.samples)
+    pixels = sum(pixels_of(sample) for sample in problem.samples)
     calls = sum(_calls(method, len(problem.samples)) for method in config.methods)
     structures = math.prod(
         len(p.choices)
@@ -59,12 +59,6 @@ def files_engine(blur: BlurFilter, jobs: Sequence[Job]) -> Engine:
             continue
         return blur.engine_for(height * width * len(jobs) * (1 + len(job.samples)))
     return blur.engine
-
-
-def _pixels(sample: AnySample) -> int:
-    """Return how many pixels are filtered in one evaluation of a window."""
-    frames = 1 if isinstance(sample, Sample) else sum(len(step) for step in sample.steps)
-    return math.prod(sample.size) * frames
 
 
 def _calls(method: Method, windows: int) -> float:

@@ -93,6 +93,14 @@ class PruningSpec(Config):
         description="each rung has so many times the windows of the one before; with sha and "
         "hyperband one trial in so many goes on",
     )
+    crop: float | None = Field(
+        None,
+        gt=0,
+        lt=1,
+        description="rungs before the last see a part of each window alone, where the most moves; "
+        "its edges are so much of the window's, and it costs the square of that; left out: whole "
+        "windows",
+    )
     startup: int = Field(5, ge=1, description="so many trials at the beginning see all windows")
 
 

@@ -13,6 +13,7 @@ from tuning.cost import cost_at
 from tuning.groups import AnyGroup, join, kind_of
 from tuning.objective_config import ObjectiveSpec
 from tuning.reduction import tail_weights
+from tuning.smaller import smaller
 from tuning.windows import AnySample
 
 __all__ = ["Problem"]
@@ -56,13 +57,22 @@ class Problem:
         largest = max(s.size[0] * s.size[1] for s in self.samples)
         return max(1, _budget(self.samples[0]) // largest)
 
-    def subset(self, chosen: Sequence[int]) -> Problem:
+    def subset(self, chosen: Sequence[int], crop: float | None = None) -> Problem:
         """Return the objective of some of the windows.
 
         Args:
             chosen: Their positions.
+            crop: Edge of the part of each window that counts, as `smaller` takes it; all of each
+                window if left out.
         """
-        return Problem(self.blur, [self.samples[i] for i in chosen], self.objective, self.free)
+        samples = [self.samples[i] for i in chosen]
+        return Problem(self.blur, self._cropped(samples, crop), self.objective, self.free)
+
+    def _cropped(self, samples: Sequence[AnySample], crop: float | None) -> Sequence[AnySample]:
+        if crop is None:
+            return samples
+        tile_size = int(getattr(self.blur.config, "tile_size", 16))
+        return [smaller(sample, crop, tile_size) for sample in samples]
 
     def map(self, function: Callable[[Problem, T], R], items: Sequence[T]) -> list[R]:
         """Return `function(problem, item)` for items that do not depend on each other, in order.

@@ -17,9 +17,11 @@ from tuning.data_config import Crops
 from tuning.error_maps import error_map
 from tuning.mixture import window_weights
 
-__all__ = ["AnySample", "Sample", "SequenceSample", "make_samples"]
+__all__ = ["MOVING", "AnySample", "Sample", "SequenceSample", "make_samples"]
 
-_MOVING = 0.5  # px over the open shutter; less is not seen as blur
+MOVING = 0.5
+"""Least motion over the open shutter that counts, px; less is not seen as blur."""
+
 _CANDIDATE_STEPS = 8  # windows are placed on a grid of 1/8 of their size
 
 
@@ -177,7 +179,7 @@ def _cut_out(case: AnyCase, box: _Box, blur: BlurFilter | None, weight: float) -
 def _moving(case: AnyCase) -> Tensor:
     """Return how often each pixel moves, in [0, 1], (1, 1, H, W)."""
     frames = [case.frame] if isinstance(case, Case) else list(case.sharp or case.samples[0])
-    moves = [f.velocity.norm(dim=1, keepdim=True) * case.shutter.open > _MOVING for f in frames]
+    moves = [f.velocity.norm(dim=1, keepdim=True) * case.shutter.open > MOVING for f in frames]
     return torch.stack([m.to(device="cpu", dtype=torch.float64) for m in moves]).mean(dim=0)
 
 

@@ -39,6 +39,7 @@ MODES = {
     "sha": {"trials": 14, "pruning": {"startup": 2}},
     "hyperband": {"trials": 14, "pruning": {"pruner": "hyperband", "startup": 2}},
     "median": {"trials": 14, "population": 3, "pruning": {"pruner": "median", "startup": 2}},
+    "parts": {"trials": 14, "pruning": {"startup": 2, "crop": 0.5}},
     "polish": {"trials": 8, "polish": {"steps": 3}},
     "all": {"trials": 10, "population": 3, "polish": {"steps": 2}, "pruning": {"startup": 1}},
 }
@@ -383,6 +384,7 @@ class TestConfig:
             ({"pruning": {"pruner": "asha"}}, r"`pruner`: .*got 'asha' \(.*methods\.0\.pruning"),
             ({"pruning": {"first": 1.0}}, r"`first`: .*less than 1, got 1\.0"),
             ({"pruning": {"factor": 1}}, r"`factor`: .*2, got 1"),
+            ({"pruning": {"crop": 1.0}}, r"`crop`: .*less than 1, got 1\.0"),
             ({"pruning": {"rungs": 3}}, r"unknown key `rungs`"),
         ],
     )
