@@ -12,74 +12,23 @@ from __future__ import annotations
 import copy
 import dataclasses
 import pickle
-from collections.abc import Callable
-from typing import Any, ClassVar
 
 import pytest
 import torch
-from torch import Tensor
 
 from torchblur.errors import ConfigError, FrameError
-from torchblur.filters import BlurFilter, get_filter
+from torchblur.filters import get_filter
 from torchblur.frame import Frame
-from torchblur.params import declared
-from torchblur.testing.frames import as_stream, constant_motion, moving_square, random_frame
-from torchblur.testing.kernels import traced_kernels
-from torchblur.testing.probes import (
-    box_blur,
-    inside,
-    mirrored,
-    mirrored_frame,
-    numbers,
-    other_values,
-)
+from torchblur.testing.frames import constant_motion, moving_square, random_frame
+from torchblur.testing.gradients import GradientContract
+from torchblur.testing.machine import MachineContract
+from torchblur.testing.probes import box_blur, mirrored, mirrored_frame, numbers, other_values
 
 __all__ = ["FilterContract"]
 
-_STEP = 0.1  # finite difference of a weak parameter, as a share of its range
 
-
-class FilterContract:
+class FilterContract(GradientContract, MachineContract):
     """Tests that every filter passes: identity, symmetry, gradients, one source, errors."""
-
-    filter_class: ClassVar[type[BlurFilter]]
-    function: ClassVar[Callable[..., Tensor]]
-    plain: ClassVar[dict[str, Any]] = {}
-    """Parameters that take the noise out, under which the symmetries hold exactly."""
-    acts_with: ClassVar[dict[str, dict[str, Any]]] = {}
-    """Per parameter: what else must be set for it to act at all."""
-    inert: ClassVar[tuple[str, ...]] = ()
-    """Parameters of all filters that change nothing in this one."""
-    one_structure: ClassVar[dict[str, Any]] = {}
-    """For compiled taps: switches that make one kernel, whatever the frame, or a small one."""
-    box_tolerance: ClassVar[float] = 0.02
-    """Largest mean difference to a box blur under uniform motion, color in [0, 1]."""
-
-    def blur(self, **params: Any) -> BlurFilter:
-        """Return the filter with its `plain` parameters and some others."""
-        return self.filter_class(**(self.plain | params))
-
-    # -- hooks for filters that need more than color, velocity and depth -----------------------
-
-    def given(self, frame: Frame) -> Frame:
-        """Return a frame with the layers that the filter needs."""
-        return as_stream(frame) if "time" in self.filter_class.needs else frame
-
-    def outcome(self, blur: BlurFilter, frame: Frame, **overrides: Any) -> dict[str, Tensor]:
-        """Return the layers that are looked at; a filter with a memory may run twice."""
-        return blur.layers(frame, **overrides)
-
-    def image(self, blur: BlurFilter, frame: Frame, **overrides: Any) -> Tensor:
-        """Return the color of `outcome`."""
-        return self.outcome(blur, frame, **overrides)["color"]
-
-    def by_function(self, frame: Frame, config: Any = None, **params: Any) -> Tensor:
-        """Return the color that the filter's function gives."""
-        return self.function(frame, config=config, **params)
-
-    def backwards(self, frame: Frame) -> Frame:
-        """Return what moves the other way, and is to blur into the same image."""
-        return dataclasses.replace(frame, velocity=-frame.velocity)
 
     # -- identity ------------------------------------------------------------------------------
 
@@ -125,10 +74,6 @@ class FilterContract:
         unblurred = (frame.color - expected)[..., inner].abs().mean()
         assert float(difference) < 0.2 * float(unblurred)
 
-    def long_reach(self) -> dict[str, Any]:
-        """Return the parameters under which a blur of 12 px is not cut short."""
-        return {"tile_size": 40} if "tile_size" in declared(self.filter_class.config_class) else {}
-
     # -- symmetries ----------------------------------------------------------------------------
 
     @pytest.mark.parametrize("kind", ["mirror_x", "mirror_y", "transpose"])
@@ -160,10 +105,6 @@ class FilterContract:
         inner = (..., slice(20, -20), slice(20, -20))
         whole = self.image(blur, frame)[..., 10:60, 20:80]
         assert torch.allclose(self.image(blur, shifted)[inner], whole[inner], atol=1e-5)
-
-    def tiles_of_10(self) -> dict[str, Any]:
-        """Return a tile size of 10, if the filter has tiles."""
-        return {"tile_size": 10} if "tile_size" in declared(self.filter_class.config_class) else {}
 
     def test_scale_of_radiance(self) -> None:
         frame = self.given(random_frame())
@@ -255,182 +196,6 @@ class FilterContract:
         other.load_state_dict(blur.state_dict())
         assert torch.equal(self.image(other, frame), self.image(blur, frame))
         assert get_filter(self.filter_class.name) is self.filter_class
-
-    # -- gradients -----------------------------------------------------------------------------
-
-    def test_gradcheck_of_the_layers(self) -> None:
-        frame = self.given(moving_square(7, 8, dtype=torch.float64))
-        blur = self.blur(**self.few_taps())
-
-        def run(color: Tensor, velocity: Tensor, depth: Tensor) -> Any:
-            changed = dataclasses.replace(frame, color=color, velocity=velocity, depth=depth)
-            return self.image(blur, changed)
-
-        layers = (frame.color, frame.velocity, frame.require("depth"))
-        assert torch.autograd.gradcheck(
-            run,
-            [t.clone().requires_grad_() for t in layers],
-            eps=1e-7,
-            atol=1e-5,
-            rtol=1e-4,
-            fast_mode=True,
-        )
-
-    def test_smooth_parameters_pass_gradcheck_and_act(self) -> None:
-        frame = self.given(moving_square(dtype=torch.float64))
-        for name, spec in numbers(self.filter_class):
-            if spec.grad != "smooth":
-                continue
-            blur = self.blur(**(self.few_taps() | self.acts_with.get(name, {})))
-            value = inside(spec, getattr(blur.config, name)).requires_grad_()
-            run = self.as_function_of(blur, frame, name)
-            assert torch.autograd.gradcheck(
-                run, (value,), eps=1e-7, atol=1e-5, rtol=1e-3, fast_mode=True
-            ), name
-            (grad,) = torch.autograd.grad(run(value).square().mean(), value)
-            assert float(grad.abs()) > 1e-7, f"{name} has no gradient"
-
-    def test_weak_parameters_act_where_autograd_is_wrong(self) -> None:
-        frame = self.given(moving_square(dtype=torch.float64))
-        for name, spec in numbers(self.filter_class):
-            if spec.grad != "weak":
-                continue
-            blur = self.filter_class(**self.acts_with.get(name, {}))
-            middle = spec.to_unit(inside(spec, getattr(blur.config, name)))
-            run = self.as_function_of(blur, frame, name)
-            unit = middle.clone().requires_grad_()
-            value = run(spec.from_unit(unit)).square().mean()
-            grad = 0.0
-            if value.requires_grad:
-                (slope,) = torch.autograd.grad(value, unit, allow_unused=True)
-                grad = 0.0 if slope is None else float(slope)
-            with torch.no_grad():
-                below, above = (
-                    float(run(spec.from_unit(middle + step)).square().mean())
-                    for step in (-_STEP, _STEP)
-                )
-            difference = (above - below) / (2 * _STEP)
-            assert difference != 0, f"{name} does nothing"
-            wrong = abs(grad - difference) / abs(difference)
-            assert wrong > 0.05, f"{name} is called weak, yet its gradient is right to {wrong:.1%}"
-
-    @pytest.mark.parametrize("case", ["still", "level depths", "background", "ties"])
-    def test_gradients_are_finite(self, case: str) -> None:
-        frame = self.given(random_frame())
-        velocity, depth = frame.velocity, frame.require("depth")
-        if case == "still":
-            velocity = velocity.clone()
-            velocity[..., :16] = 0
-        elif case == "level depths":
-            depth = torch.full_like(depth, 4.0)
-        elif case == "background":
-            depth = depth.clone()
-            depth[..., 5:] = torch.inf
-        elif case == "ties":
-            velocity = torch.ones_like(velocity) * 8
-        leaves = [t.clone().requires_grad_() for t in (frame.color, velocity, depth)]
-        blur = self.filter_class()
-        changed = dataclasses.replace(frame, color=leaves[0], velocity=leaves[1], depth=leaves[2])
-        result = self.image(blur, changed)
-        result.square().sum().backward()
-        assert bool(torch.isfinite(result).all())
-        for leaf in (*leaves, *blur.parameters()):
-            assert leaf.grad is None or bool(torch.isfinite(leaf.grad).all())
-        assert leaves[0].grad is not None
-        assert float(leaves[0].grad.abs().sum()) > 0
-
-    def as_function_of(
-        self, blur: BlurFilter, frame: Frame, name: str
-    ) -> Callable[[Tensor], Tensor]:
-        """Return the image as a function of one parameter."""
-        return lambda value: self.image(blur, frame, **{name: value})
-
-    def few_taps(self) -> dict[str, Any]:
-        """Return a number of taps that keeps gradcheck quick."""
-        return {"num_samples": 7} | self.tiles_of_10()
-
-    # -- machine -------------------------------------------------------------------------------
-
-    @pytest.mark.slow
-    def test_compiled_equals_eager_with_gradients(self) -> None:
-        results = []
-        for engine in ("eager", "compiled"):
-            frame = self.given(moving_square())
-            color = frame.color.clone().requires_grad_()
-            frame = dataclasses.replace(frame, color=color)
-            params = self.few_taps() | self.one_structure
-            blur = self.filter_class(None, engine=engine, **params)
-            image = self.image(blur, frame)
-            image.square().mean().backward()
-            used = [p.grad for p in blur.parameters() if p.grad is not None]
-            results.append([image, color.grad, *used])
-        for eager, compiled in zip(*results, strict=True):
-            assert torch.allclose(eager, compiled, atol=1e-5, rtol=1e-4)
-
-    def test_compiled_once_per_structure(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        compiled = traced_kernels(monkeypatch)
-        frame, other = (self.given(random_frame(40, 44, seed=seed)) for seed in (1, 2))
-        params = self.few_taps() | self.one_structure
-        blur = self.filter_class(None, engine="compiled", **params)
-
-        def run(frame: Frame, **overrides: Any) -> int:
-            leaf = frame.color.clone().requires_grad_()
-            blur.requires_grad_(False)
-            image = self.image(blur, dataclasses.replace(frame, color=leaf), **overrides)
-            image.square().sum().backward()
-            return compiled()
-
-        sets: list[dict[str, Tensor]] = [{}, {}]
-        for name, spec in numbers(self.filter_class):
-            values = spec.from_unit(torch.tensor([0.3, 0.6, 0.7]))
-            one, two, _ = values.tolist()
-            before = run(frame, **{name: one})  # a special value may be a structure of its own
-            assert run(frame, **{name: two}) == before, name
-            for given, count in zip(sets, (2, 3), strict=True):
-                given[name] = values[:count].view(-1, 1, 1, 1)
-        before = run(frame, **sets[0])
-        assert run(frame, **sets[1]) == before
-        before = run(Frame.stack([frame, other]))
-        assert run(Frame.stack([frame, other, frame])) == before
-        assert run(self.given(random_frame(50, 60))) == before
-        blur = self.filter_class(None, engine="compiled", **(params | {"shutter": 0.8}))
-        assert run(frame) == before
-
-    @pytest.mark.parametrize("size", [(1, 1), (1, 9), (7, 1), (13, 41)])
-    def test_any_size(self, size: tuple[int, int]) -> None:
-        frame = self.given(random_frame(*size))
-        assert self.image(self.filter_class(), frame).shape == frame.color.shape
-
-    def test_types_and_strides(self) -> None:
-        frame = self.given(moving_square())
-        blur = self.filter_class()
-        strided = frame.map(lambda t: t.transpose(2, 3).contiguous().transpose(2, 3))
-        assert not strided.color.is_contiguous()
-        assert torch.equal(self.image(blur, strided), self.image(blur, frame))
-        fine = self.image(blur, frame.to(dtype=torch.float64))
-        assert fine.dtype == torch.float64
-        coarse = self.image(blur, frame.to(dtype=torch.bfloat16))
-        assert coarse.dtype == torch.bfloat16
-        assert bool(torch.isfinite(coarse).all())
-
-    def test_inputs_are_not_changed(self) -> None:
-        frame = self.given(moving_square())
-        before = {name: layer.clone() for name, layer in frame.layers().items()}
-        self.image(self.filter_class(), frame)
-        for name, layer in frame.layers().items():
-            assert torch.equal(layer, before[name])
-
-    def test_invalid_pixels_lend_no_color(self) -> None:
-        frame = self.given(moving_square())
-        poisoned = frame.color.clone()
-        poisoned[..., 8:12, 8:12] = torch.nan
-        with pytest.warns(UserWarning, match="48 values"):
-            masked = dataclasses.replace(frame, color=poisoned, on_invalid="mask")
-        grey = masked.map(lambda t: torch.ones_like(t) if t.shape[1] == 3 else t)
-        color = torch.where(masked.require("valid"), grey.color, torch.zeros(()))
-        blurred = self.image(self.filter_class(), dataclasses.replace(masked, color=color))
-        valid = masked.require("valid").expand_as(blurred)
-        assert torch.allclose(blurred[valid], torch.ones(()), atol=1e-5)
 
     # -- errors --------------------------------------------------------------------------------
 
