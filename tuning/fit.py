@@ -167,7 +167,7 @@ def _evaluate(
     stage = Stage("evaluation", len(setting.cases), setting.progress)
     scores = score_cases(setting.cases, variants, stage) + _ceiling_scores(setting, tuned)
     slopes = measure_sensitivity(
-        setting.problem, setting.space, start, tuned, _unroll(setting.config)
+        setting.problem, setting.space, start, tuned, _unroll(setting.config), setting.progress
     )
     params = setting.config.filter.params | tuned | _common_shutter(setting)
     result = FitResult(

@@ -17,6 +17,7 @@ import torch
 from torch import Tensor
 
 from tuning.problem import Problem
+from tuning.progress import Progress, Stage
 from tuning.result import SensitivityResult
 from tuning.space import Space
 
@@ -130,6 +131,7 @@ def measure_sensitivity(
     start: Mapping[str, Any],
     tuned: Mapping[str, Any],
     unroll: int | None = None,
+    progress: Progress | None = None,
 ) -> dict[str, SensitivityResult]:
     """Return slopes and rises of all floats, at the start values and at the tuned ones.
 
@@ -139,16 +141,22 @@ def measure_sensitivity(
         start: Values before the fit.
         tuned: Values after it.
         unroll: Of sequences: gradients go back through at most so many frames.
+        progress: Told after each of the four parts.
     """
     floats = space.continuous()
     if not floats.names:
         return {}
+    stage = Stage("sensitivity", 4, progress)
     before = differences(problem, floats, start, _START_STEP)
+    stage.step(1)
     after = differences(problem, floats, tuned, _STEP)
-    columns = {
-        "start_gradient": gradient_slopes(problem, floats, start, unroll),
+    stage.step(2)
+    columns = {"start_gradient": gradient_slopes(problem, floats, start, unroll)}
+    stage.step(3)
+    columns["gradient"] = gradient_slopes(problem, floats, tuned, unroll)
+    stage.step(4)
+    columns |= {
         "start_difference": before.slopes(),
-        "gradient": gradient_slopes(problem, floats, tuned, unroll),
         "difference": after.slopes(),
         "rise": after.rises(),
     }
