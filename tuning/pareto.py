@@ -85,6 +85,7 @@ class _Search:
     def __init__(self, problem: Problem, job: ParetoJob) -> None:
         self.problem, self.job = problem, job
         self.study = new_study(objectives=_OBJECTIVES)
+        self.later_seconds = self.later_cpu_seconds = 0.0  # of what follows the trials
         self.first = (*job.first, *_sweep(problem, job, job.first[-1]))
 
     @property
@@ -139,8 +140,8 @@ class _Search:
             objective=best.objective,
             evaluations=evaluations,
             passes=evaluations,
-            seconds=sum(t.user_attrs["seconds"] for t in trials),
-            cpu_seconds=sum(t.user_attrs["cpu_seconds"] for t in trials),
+            seconds=self.later_seconds + sum(t.user_attrs["seconds"] for t in trials),
+            cpu_seconds=self.later_cpu_seconds + sum(t.user_attrs["cpu_seconds"] for t in trials),
             dropped=len(trials) - len(self._complete()),
             polished=polished,
             importances=self._importances(),
@@ -148,6 +149,11 @@ class _Search:
                 points=tuple(points), front=front_of(points), picks=pick(points, job.method.budgets)
             ),
         )
+
+    def note_time(self, stored: Mapping[str, Any]) -> None:
+        """Add the time of what followed the trials, as its checkpoint has it."""
+        self.later_seconds += stored.get("seconds", 0.0)
+        self.later_cpu_seconds += stored.get("cpu_seconds", 0.0)
 
     def _complete(self) -> list[FrozenTrial]:
         return self.study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,))
@@ -291,9 +297,16 @@ def _polished(
     stored = None if folder is None else folder.load_state(name)
     if stored is None:
         stage.step(0, message=f"gradient steps from {len(chosen)} presets")
-        stored = {"found": [_plain(after) for after in _steps(search, chosen, smooth)]}
+        clock = time.monotonic()
+        steps = _steps(search, chosen, smooth)
+        stored = {
+            "found": [_plain(after) for after in steps],
+            "seconds": time.monotonic() - clock,
+            "cpu_seconds": sum(after.cpu_seconds for after in steps),
+        }
         if folder is not None:
             folder.save_state(name, stored)
+    search.note_time(stored)
     stage.step(len(chosen), best=min((loss for _, loss in stored["found"]), default=None))
     made = []
     for place, (point, (params, loss)) in enumerate(zip(chosen, stored["found"], strict=True)):
@@ -314,9 +327,13 @@ def _swept(
     name = f"swept-{search.job.index}.pt"
     stored = None if folder is None else folder.load_state(name)
     if stored is None:
-        stored = {"losses": search.evaluate(others)}
+        clock, cpu = time.monotonic(), time.process_time()
+        losses = search.evaluate(others)
+        spent = {"seconds": time.monotonic() - clock, "cpu_seconds": time.process_time() - cpu}
+        stored = {"losses": losses} | spent
         if folder is not None:
             folder.save_state(name, stored)
+    search.note_time(stored)
     found = zip(others, stored["losses"], strict=True)
     first = made[-1].number + 1
     return [

@@ -79,6 +79,14 @@ def test_presets_filter_what_they_were_scored_on(run):
     assert int(blur.config.num_samples) == picked.params["num_samples"]
 
 
+def test_gradient_steps_count_in_its_time(run):
+    folder, result = run
+    names = ("polished-0.pt", "swept-0.pt")
+    later = [torch.load(folder / name, weights_only=True)["cpu_seconds"] for name in names]
+    assert min(later) > 0
+    assert result.methods[0].cpu_seconds > sum(later)
+
+
 def test_dear_presets_are_better_where_they_were_searched(run):
     _, result = run
     picked = result.methods[0].pareto.picked()
