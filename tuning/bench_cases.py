@@ -48,6 +48,7 @@ class Case(Config):
     sets: int = Field(1, ge=1, description="parameter sets of one frame")
     shared: tuple[str, ...] = Field((), description="smooth parameters that all sets have alike")
     apart: bool = Field(False, description="one call for each frame or set, instead of one for all")
+    storage: Literal["full", "half"] = Field("full", description="of what the taps look up")
     params: dict[str, Any] = Field(default_factory=dict, description="parameters of the filter")
 
     @property
@@ -78,6 +79,7 @@ class Case(Config):
         parts += [f"{self.moving} % moving"] if self.moving < 100 else []
         parts += [f"batch {self.batch}"] if self.batch > 1 else []
         parts += [f"{self.sets} sets"] if self.sets > 1 else []
+        parts += ["half storage"] if self.storage == "half" else []
         return " ".join(parts + (["apart"] if self.apart else []))
 
 

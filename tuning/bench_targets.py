@@ -193,6 +193,7 @@ def _ratios(guertin: Case, shrink: int) -> list[Target]:
     return [
         _ratio("10 % of the area moves, over all of it", 0.2, some, guertin),
         _ratio("nothing moves, over all of it", 0.03, still, guertin),
+        _ratio("half-precision storage, over full", 1.0, guertin.but(storage="half"), guertin),
         _ratio("forward and backward of a fit (all parameters), over forward", 4.0, step, guertin),
         _ratio("the same, with the gradient of the color", 4.0, backward, guertin),
         Target(

@@ -41,7 +41,8 @@ def make_filter(case: Case) -> BlurFilter:
     params = dict(case.params)
     if case.num_samples is not None:
         params["num_samples"] = case.num_samples
-    return create_filter(case.filter, engine=case.engine, **params).to(torch.device(case.device))
+    blur = create_filter(case.filter, engine=case.engine, storage=case.storage, **params)
+    return blur.to(torch.device(case.device))
 
 
 def has_taps(blur: BlurFilter | type[BlurFilter]) -> bool:

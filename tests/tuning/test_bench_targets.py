@@ -39,6 +39,7 @@ class TestOnTheCpu:
         rows = rows_for(cpu_s=2.0, peak_mib=100.0, compile_s=9.0)
         rows = with_figures(rows, GUERTIN.but(moving=10), cpu_s=0.3)
         rows = with_figures(rows, GUERTIN.but(moving=0), cpu_s=0.1)
+        rows = with_figures(rows, GUERTIN.but(storage="half"), cpu_s=1.8)
         rows = with_figures(rows, GUERTIN.but(what="backward"), cpu_s=9.0, peak_mib=250.0)
         rows = with_figures(rows, GUERTIN.but(what="parameters"), cpu_s=7.0)
         sets = GUERTIN.but(width=128, height=128, sets=32)
@@ -53,6 +54,7 @@ class TestOnTheCpu:
             "guertin2014, 1280x720, N = 35, eager": (2.0, True),
             "10 % of the area moves, over all of it": (0.15, True),
             "nothing moves, over all of it": (0.05, False),
+            "half-precision storage, over full": (0.9, True),
             "forward and backward of a fit (all parameters), over forward": (3.5, True),
             "the same, with the gradient of the color": (4.5, False),
             "forward and backward, over forward: peak memory": (2.5, True),

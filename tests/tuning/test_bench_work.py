@@ -55,6 +55,10 @@ class TestCalls:
         assert image.shape == (1, 3, 32, 48)
         assert image.isfinite().all()
 
+    def test_half_storage_rounds(self):
+        full, half = (make_call(SMALL.but(storage=kind))() for kind in ("full", "half"))
+        assert 0 < (full - half).abs().max() < 1e-2
+
     def test_sets_differ(self):
         one = make_call(SMALL.but(sets=2))()
         assert not torch.equal(one[0], one[1])
