@@ -32,7 +32,7 @@ from tuning.frame_cache import cache_folder, cache_key, cached, frame_of, planes
 from tuning.numbering import frame_numbers, numbered_file
 from tuning.streams import ExrStreamJob, SceneStreamJob
 
-__all__ = ["Case", "SequenceCase", "cache_folder", "load_cases"]
+__all__ = ["Case", "SequenceCase", "cache_folder", "draw_cases", "load_cases"]
 
 
 def load_cases(
@@ -69,6 +69,19 @@ def load_cases(
         cases.append(dataclasses.replace(case, item=key, weight=weight))
     refuse_repeats(cases)
     return with_unique_names(cases)
+
+
+def draw_cases(root: str, key: str, item: FamilyData | FamilyStreamData) -> list[AnyCase]:
+    """Render scenes of a family for the fit, beside those that `load_cases` returned.
+
+    Args:
+        root: What the item's path is relative to.
+        key: Of the item in the configuration.
+        item: Which scenes, and how they are rendered.
+    """
+    jobs = _jobs(Path(root), item, key)
+    cases = [job.load("train") for job in jobs]
+    return [dataclasses.replace(case, item=key, weight=item.weight) for case in cases]
 
 
 # -- one case --------------------------------------------------------------------------------------

@@ -13,6 +13,7 @@ from torchblur.filters import BlurFilter
 from torchblur.frame import Frame
 from tuning.blurring import arguments, blurred, blurred_sequence
 from tuning.config import ObjectiveSpec
+from tuning.meter import Meter
 from tuning.objective import PreparedObjective, prepare_objective
 from tuning.windows import AnySample, Sample, SequenceSample
 
@@ -38,10 +39,15 @@ class FrameGroup:
         values: Mapping[str, Any],
         free: Sequence[str],
         unroll: int | None = None,
+        meter: Meter | None = None,
     ) -> Iterator[Tensor]:
         """Yield the objective of each window, or of each parameter set, (M,) or (K,)."""
+        meter = meter or Meter()
+        meter.enter("filter")
         image = blurred(blur, self.frame, self.shutter, self.position, values, free)
         safe, finite = _scored(image, self.inner)
+        meter.on_the_way_back(safe, "filter")
+        meter.enter("metric")
         yield _checked(self.objective(safe), finite) * self.weight.to(safe)
 
 
@@ -70,24 +76,31 @@ class SequenceGroup:
         values: Mapping[str, Any],
         free: Sequence[str],
         unroll: int | None = None,
+        meter: Meter | None = None,
     ) -> Iterator[Tensor]:
         """Yield parts whose sum is the objective of each window or parameter set, (M,) or (K,).
 
         The memory is cut off from the graph where a part ends, so going backward through one part
         after the other is enough, and each can be forgotten.
         """
+        meter = meter or Meter()
+        meter.enter("filter")
         given = arguments(self.shutter, self.position, values, free, self.steps[0][0].device)
         images = blurred_sequence(blur, self.steps, self.cuts, given, unroll=unroll)
         total: Tensor | None = None
         before: Tensor | None = None
         for index, image in enumerate(images):
             safe, finite = _scored(image, self.inner)
+            meter.on_the_way_back(safe, "filter")
+            meter.enter("metric")
             loss = _checked(self._loss(index, safe, before), finite) * self.weight.to(safe)
+            meter.on_the_way_back(loss, "metric")
             total = loss if total is None else total + loss
             before = safe
             if unroll is not None and (index + 1) % unroll == 0:
                 yield total
                 total, before = None, safe.detach()
+            meter.enter("filter")
         if total is not None:
             yield total
 

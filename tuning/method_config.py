@@ -18,6 +18,7 @@ __all__ = [
     "PolishSpec",
     "PolishSteps",
     "PruningSpec",
+    "RefreshSpec",
     "check_method",
     "polished_names",
 ]
@@ -47,15 +48,58 @@ class _Windows(Config):
     )
 
 
+class RefreshSpec(Config):
+    """Scenes of a family that are replaced by new ones while a gradient method goes on."""
+
+    every: int = Field(10, ge=1, description="after so many steps …")
+    scenes: int = Field(
+        1,
+        ge=1,
+        description="… so many scenes of the families in `data.train` are replaced, in turn, by "
+        "scenes with seeds of their own, none of which is in the data",
+    )
+    spp: int = Field(
+        32,
+        ge=2,
+        description="samples per pixel of the new references; their noise averages out over "
+        "steps: it adds no bias to the gradient of squared errors, a small one to that of the "
+        "others (absolute errors, FLIP, SSIM)",
+    )
+
+
 class GradientMethod(_MethodBase, _Windows):
-    """Adam in the unit cube, from several starts at once; for smooth parameters."""
+    """Adam in the unit cube from several starts at once, or L-BFGS; for smooth parameters."""
 
     kind: Literal["gradient"]
-    steps: int = Field(100, ge=1, description="steps of the optimizer")
+    optimizer: Literal["adam", "lbfgs"] = Field(
+        "adam",
+        description="adam; lbfgs: a quasi-Newton method with a line search, over all windows, "
+        "start by start",
+    )
+    steps: int = Field(
+        100,
+        ge=1,
+        description="steps of the optimizer; one of lbfgs takes as many evaluations as its line "
+        "search needs, mostly one or two",
+    )
     starts: int = Field(4, ge=1, description="the first at the start values, the others random")
     learning_rate: float = Field(
-        0.03, gt=0, le=1, description="first step, as a fraction of each range; falls by a cosine"
+        0.03,
+        gt=0,
+        le=1,
+        description="first step, as a fraction of each range; adam's falls by a cosine, lbfgs "
+        "finds the length of the others by itself",
     )
+    refresh: RefreshSpec | None = Field(
+        None,
+        description="replace scenes of families as the steps go on; left out: all steps see the "
+        "same scenes",
+    )
+
+    @property
+    def is_sampled(self) -> bool:
+        """Whether steps see other windows, so that their losses cannot be compared."""
+        return self.batch is not None or self.refresh is not None
 
 
 class PolishSteps(_Windows):
@@ -195,9 +239,11 @@ def check_method(
 
     Raises:
         ConfigError: a parameter without a usable gradient; nothing to polish; a sampler that
-            cannot learn from what is polished; too small a generation.
+            cannot learn from what is polished; too small a generation; an optimizer that needs
+            the same windows in all steps.
     """
     if isinstance(method, GradientMethod):
+        _check_optimizer(method, place)
         for name in names:
             _check_gradient(name, specs[name], bool(method.free), place)
     elif isinstance(method, BlackBoxMethod):
@@ -212,6 +258,15 @@ def _check_generation(method: BlackBoxMethod, place: str) -> None:
             f"a generation of cmaes needs at least {_LEAST_GENERATION} candidates, got "
             f"`population: {method.population}`; 1 leaves its size to the sampler "
             f"({place}.population)"
+        )
+
+
+def _check_optimizer(method: GradientMethod, place: str) -> None:
+    if method.optimizer == "lbfgs" and method.is_sampled:
+        key = "refresh" if method.batch is None else "batch"
+        raise ConfigError(
+            "lbfgs compares losses along a line, so all steps must see the same windows: leave "
+            f"`{key}` out, or take adam ({place}.{key})"
         )
 
 

@@ -8,9 +8,10 @@ from torchblur.filters import get_filter
 from torchblur.params import declared
 from tuning.blackbox import BlackBoxJob, fit_blackbox
 from tuning.config import TuneConfig, free_names
-from tuning.gradient import GradientJob, fit_gradient
+from tuning.gradient import GradientJob, fit_gradient, seed_of
 from tuning.method_config import GradientMethod, ParetoMethod, polished_names
 from tuning.pareto import ParetoJob, fit_pareto
+from tuning.pool import Pool
 from tuning.problem import Problem
 from tuning.progress import Progress
 from tuning.result import MethodResult
@@ -41,7 +42,7 @@ def run_methods(
 
     Raises:
         FitError: a method has no parameter set with a finite loss.
-        ConfigError: too few windows for the rungs of a pruner.
+        ConfigError: too few windows for the rungs of a pruner; nothing to draw new scenes from.
     """
     results: list[MethodResult] = []
     for index, method in enumerate(config.methods):
@@ -59,7 +60,8 @@ def run_methods(
         }
         if isinstance(method, GradientMethod):
             gradient = GradientJob(method=method, **common)
-            result = fit_gradient(problem, gradient, folder, progress)
+            pool = _pool(config, problem, index, method)
+            result = fit_gradient(problem, gradient, folder, progress, pool)
         elif isinstance(method, ParetoMethod):
             front = ParetoJob(method=method, **common)
             result = fit_pareto(problem, front, folder, progress)
@@ -70,6 +72,12 @@ def run_methods(
             result = fit_blackbox(problem, search, folder, progress)
         results.append(result)
     return results
+
+
+def _pool(config: TuneConfig, problem: Problem, index: int, method: GradientMethod) -> Pool | None:
+    if method.refresh is None:
+        return None
+    return Pool(problem, config.data, method.refresh, seed_of(config.seed, index))
 
 
 def method_name(config: TuneConfig, index: int) -> str:

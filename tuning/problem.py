@@ -11,6 +11,7 @@ from torch import Tensor
 from torchblur.filters import BlurFilter
 from tuning.cost import cost_at
 from tuning.groups import AnyGroup, join, kind_of
+from tuning.meter import Meter
 from tuning.objective_config import ObjectiveSpec
 from tuning.reduction import tail_weights
 from tuning.smaller import smaller
@@ -48,6 +49,7 @@ class Problem:
         self.samples = tuple(samples)
         self.objective = objective
         self.free = tuple(free)
+        self.meter = Meter()
         self._single: dict[int, AnyGroup] = {}
         self._joined: list[tuple[list[int], AnyGroup]] | None = None
 
@@ -67,6 +69,20 @@ class Problem:
         """
         samples = [self.samples[i] for i in chosen]
         return Problem(self.blur, self._cropped(samples, crop), self.objective, self.free)
+
+    def with_samples(self, samples: Sequence[AnySample]) -> Problem:
+        """Return the same objective over other windows; what is known of those that stay is kept.
+
+        Args:
+            samples: All of its windows.
+        """
+        other = Problem(self.blur, samples, self.objective, self.free)
+        other.meter = self.meter
+        known = {id(self.samples[place]): group for place, group in self._single.items()}
+        for place, sample in enumerate(other.samples):
+            if id(sample) in known:
+                other._single[place] = known[id(sample)]
+        return other
 
     def _cropped(self, samples: Sequence[AnySample], crop: float | None) -> Sequence[AnySample]:
         if crop is None:
@@ -141,7 +157,7 @@ class Problem:
         for places, group in self._groups_for(count, chosen):
             if weights is not None and not bool((weights[places] > 0).any()):
                 continue
-            for losses in group.parts(self.blur, values, self.free, unroll):
+            for losses in group.parts(self.blur, values, self.free, unroll, self.meter):
                 if weights is None:
                     yield (losses if count > 1 else losses.sum(dim=0, keepdim=True)) / number
                 else:

@@ -217,7 +217,7 @@ def _events(
         passes += record["passes"]
         seconds += record["cpu_seconds"]
         method = fit.methods[record["method"]]
-        sampled = isinstance(method, GradientMethod) and method.batch is not None
+        sampled = isinstance(method, GradientMethod) and method.is_sampled
         others = results[record["method"]].params
         for index, loss in enumerate(record["loss"]):
             params = {name: values[index] for name, values in record["params"].items()}

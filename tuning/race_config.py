@@ -14,7 +14,7 @@ from torchblur.io import load_yaml
 from torchblur.params import Config, build, declared
 from tuning.config import FilterSpec, TuneConfig, resolve
 from tuning.data_config import DataSpec
-from tuning.method_config import Method
+from tuning.method_config import GradientMethod, Method
 from tuning.objective_config import ObjectiveSpec
 from tuning.overrides import apply_overrides
 
@@ -93,7 +93,8 @@ def load_race_config(path: str | Path, overrides: Sequence[str] = ()) -> RaceCon
 
     Raises:
         ConfigError: a mistake in a problem or a method, two of one name, a problem without a
-            hold-out, a planted value that is not free or out of range; with file and key.
+            hold-out, new scenes for a planted problem, a planted value that is not free or out of
+            range; with file and key.
         FileFormatError: no such file.
     """
     path = Path(path)
@@ -109,6 +110,8 @@ def load_race_config(path: str | Path, overrides: Sequence[str] = ()) -> RaceCon
             raise ConfigError(f"{problem.name!r} has no entrant ({where})")
         for entrant in config.entrants_of(resolved):
             resolve(config.fit(resolved, entrant), f"{where} for {entrant.name!r}")
+            if resolved.planted is not None:
+                _check_unplanted(entrant, where)
         problems.append(resolved)
     return config.model_copy(update={"problems": tuple(problems)})
 
@@ -149,6 +152,15 @@ def _check_names(config: RaceConfig, place: str) -> None:
                     f"no problem is called {name!r}{nearest_name(name, known)} "
                     f"({place}: entrants.{index}.only)"
                 )
+
+
+def _check_unplanted(entrant: Entrant, where: str) -> None:
+    for method in entrant.methods:
+        if isinstance(method, GradientMethod) and method.refresh is not None:
+            raise ConfigError(
+                f"`refresh` of {entrant.name!r} renders references, and those of a planted problem "
+                f"are made by the filter: name its problems in `only` ({where}.planted)"
+            )
 
 
 def _check_problem(problem: RaceProblem, where: str) -> None:

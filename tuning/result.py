@@ -49,6 +49,9 @@ class MethodResult(Config):
     seconds: float
     cpu_seconds: float = 0.0
     """Of the process, all threads."""
+    spent: dict[str, float] = Field(default_factory=dict)
+    """Of a gradient method: CPU-seconds by what they went into: "render" (new scenes), "filter",
+    "metric", "other"."""
     starts: tuple[StartResult, ...] = ()
     dropped: int = 0
     """Starts or trials with a loss that was not finite."""

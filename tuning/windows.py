@@ -36,6 +36,8 @@ class Sample:
         inner: Top, left, height and width of the scored part within the window, px.
         shutter: The shutter of the reference.
         weight: How much it counts in the mean over windows; on average 1.
+        item: Key of the data's item that it comes from.
+        origin: As in `Case`.
     """
 
     frame: Frame
@@ -44,6 +46,8 @@ class Sample:
     inner: tuple[int, int, int, int]
     shutter: Shutter
     weight: float = 1.0
+    item: str = ""
+    origin: str = ""
 
     @property
     def size(self) -> tuple[int, int]:
@@ -70,6 +74,8 @@ class SequenceSample:
         inner: Top, left, height and width of the scored part within the window, px.
         shutter: The shutter of the references.
         weight: How much it counts in the mean over windows; on average 1.
+        item: Key of the data's item that it comes from.
+        origin: As in `Case`.
     """
 
     steps: tuple[tuple[Frame, ...], ...]
@@ -80,6 +86,8 @@ class SequenceSample:
     inner: tuple[int, int, int, int]
     shutter: Shutter
     weight: float = 1.0
+    item: str = ""
+    origin: str = ""
 
     @property
     def size(self) -> tuple[int, int]:
@@ -163,6 +171,8 @@ def _cut_out(case: AnyCase, box: _Box, blur: BlurFilter | None, weight: float) -
             inner=box.inner,
             shutter=case.shutter,
             weight=weight,
+            item=case.item,
+            origin=case.origin,
         )
     return SequenceSample(
         steps=tuple(tuple(box.filtered(f) for f in step) for step in case.steps(blur)),
@@ -173,6 +183,8 @@ def _cut_out(case: AnyCase, box: _Box, blur: BlurFilter | None, weight: float) -
         inner=box.inner,
         shutter=case.shutter,
         weight=weight,
+        item=case.item,
+        origin=case.origin,
     )
 
 

@@ -6,7 +6,7 @@ import pytest
 import torch
 from planted import PLANTED, write_planted
 
-import tuning.gradient
+import tuning.gradient_state
 import tuning.groups
 from torchblur.errors import ConfigError, OutputError
 from torchblur.io import load_yaml, read_frame, read_image
@@ -110,7 +110,7 @@ class TestRecovery:
     def test_points_do_not_get_lost_outside_the_cube(self, planted_problem):
         """Outside, where the range is clamped, there is no gradient that leads back."""
         job = gradient_job(space_of({"third_gain": {"high": 3.0}}), starts=3, learning_rate=1.0)
-        state = tuning.gradient._State(job)
+        state = tuning.gradient_state.AdamState(job)
         for _ in range(3):
             state.advance(planted_problem)
             assert bool(((state.unit >= 0) & (state.unit <= 1)).all())
@@ -215,7 +215,7 @@ class TestFinishedRun:
 
     def test_progress(self, finished):
         stages = list(dict.fromkeys(event.stage for event in finished.events))
-        assert stages == ["data", "gradient", "tpe", "evaluation", "report"]
+        assert stages == ["data", "gradient", "tpe", "evaluation", "sensitivity", "report"]
         steps = [e for e in finished.events if e.stage == "gradient"]
         assert [e.done for e in steps] == [1, 2, 3, 4]
         assert steps[0].eta > 0
