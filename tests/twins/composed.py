@@ -19,6 +19,8 @@ DEFAULTS = common.DEFAULTS | {
     "second_direction": True,
     "reversed_direction": True,
     "refinements": 2,
+    "arrivals": "winner",
+    "hidden_times": "fill",
     "match_tolerance": 1.0,
     "match_slope": 0.0,
     "edge_motion": "nearest",
@@ -105,18 +107,27 @@ def at_pixel(pixel, starts, settings):
     """Return the color of a pixel, and the share of the time at which something arrives."""
     names = [n for n in starts if getattr(settings, f"{n}_direction")] or ["own"]
     front, back, count = np.zeros(4), np.zeros(4), settings.num_samples
+    seen, hidden = np.zeros(4), 0.0
     shift = settings.jitter * (settings.tap_noise[pixel.y, pixel.x] - 0.5)
     share = 0.0
     for i in range(count):
         time = common.clamp(2 * (i + 0.5 + shift) / count - 1, -1, 1) + settings.c
         arrived = [follow(pixel, starts[name], time, settings) for name in names]
-        covered, color = visible(arrived, settings)
+        covered, shares = visible(arrived, settings)
+        color = sum(w * c for w, (_, _, c) in zip(shares, arrived, strict=True))
         front += settings.foreground_gain * covered * np.array([*color, 1.0])
         share += covered
+        near = covered * (1 - abs(time) / (1 + abs(settings.c))) ** 2
+        for weight, (_, z, sample) in zip(shares, arrived, strict=True):
+            if classes(pixel.depth[pixel.y, pixel.x], z, settings)[1] > 0:
+                seen += near * weight * np.array([*sample, 1.0])
         _, z, color = look(pixel, pixel.field[pixel.y][pixel.x], time, settings)
         _, behind = classes(pixel.depth[pixel.y, pixel.x], z, settings)
         weight = settings.background_gain * (1 - covered) * behind
         back += weight * np.array([*color, 1.0])
+        hidden += (1 - covered) * (1 - behind)
+    if settings.hidden_times == "fill" and seen[3] > 1e-6:
+        back += settings.background_gain * hidden * np.array([*(seen[:3] / seen[3]), 1.0])
     alpha = sat(settings.alpha_gain * share / count)
     return resolved(pixel, front / count, back / count, alpha, settings)
 
@@ -146,7 +157,7 @@ def moving(v):
 
 
 def visible(arrived, settings):
-    """Return how much of this time is covered, and the color: the nearer hide the others."""
+    """Return how much of this time is covered, and each one's share: the nearer hide the others."""
     weights = []
     for i, (match, z, _) in enumerate(arrived):
         weight = match
@@ -156,10 +167,14 @@ def visible(arrived, settings):
                 weight *= 1 - other * in_front
         weights.append(weight)
     total = sum(weights)
-    if total <= 1e-6:
-        return 0.0, np.zeros(3)
-    color = sum(w * c for w, (_, _, c) in zip(weights, arrived, strict=True)) / total
-    return 1 - math.prod(1 - match for match, _, _ in arrived), color
+    covered = 1 - math.prod(1 - match for match, _, _ in arrived) if total > 1e-6 else 0.0
+    if settings.arrivals == "winner":
+        best = 0
+        for i, weight in enumerate(weights):
+            if weight > weights[best] + 1e-4:  # a tie goes to the first
+                best = i
+        return covered, [float(i == best) for i in range(len(weights))]
+    return covered, [weight / total if total > 1e-6 else 0.0 for weight in weights]
 
 
 def classes(z, z_other, settings):
