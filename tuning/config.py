@@ -21,7 +21,7 @@ from torchblur.params import Config, build, choices, declared
 from torchblur.presets import load_preset
 from tuning.cost_checks import check_costs
 from tuning.data_config import DataSpec
-from tuning.method_config import BlackBoxMethod, GradientMethod, Method, check_method
+from tuning.method_config import BlackBoxMethod, GradientMethod, Method, check_method, check_refresh
 from tuning.objective_config import ObjectiveSpec
 from tuning.overrides import apply_overrides
 from tuning.shared_data import with_shared_data
@@ -76,7 +76,7 @@ class FilterSpec(Config):
 
 
 class TuneConfig(Config):
-    """One fit: `torchblur tune CONFIG`, where `data` may be the path of a file with that section."""
+    """One fit: `torchblur tune CONFIG`; in the file `data` may be the path of another one."""
 
     filter: FilterSpec
     data: DataSpec
@@ -133,7 +133,7 @@ def resolve(
 
     Raises:
         ConfigError: unknown filter or parameter, value out of range, a gradient fit of a
-            parameter without a gradient.
+            parameter without a gradient, new scenes without a family.
     """
     folder = Path.cwd() if folder is None else folder
     filter_spec = resolve_filter(config.filter, place, folder)
@@ -148,6 +148,8 @@ def resolve(
     )
     names = [free_names(config, index, place) for index in range(len(config.methods))]
     check_costs(config, names, place)
+    for index, method in enumerate(config.methods):
+        check_refresh(method, config.data.train, _join(place, f"methods.{index}"))
     return config
 
 

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from typing import Annotated, Literal
 
 from pydantic import Field
 
 from torchblur.errors import ConfigError, nearest_name
 from torchblur.params import Config, Param
+from tuning.data_config import DataItem, FamilyData, FamilyStreamData
 
 __all__ = [
     "BlackBoxMethod",
@@ -20,6 +21,7 @@ __all__ = [
     "PruningSpec",
     "RefreshSpec",
     "check_method",
+    "check_refresh",
     "polished_names",
 ]
 
@@ -250,6 +252,27 @@ def check_method(
         _check_generation(method, place)
         if method.polish is not None:
             _check_polish(method, names, specs, place)
+
+
+def check_refresh(method: AnyMethod, train: Sequence[DataItem], place: str) -> None:
+    """Refuse new scenes where there is no family to draw them from.
+
+    Args:
+        method: The method.
+        train: The training data.
+        place: Key path of the method, with the file, for messages.
+
+    Raises:
+        ConfigError: no item of a family.
+    """
+    if not isinstance(method, GradientMethod) or method.refresh is None:
+        return
+    if not any(isinstance(item, FamilyData | FamilyStreamData) for item in train):
+        kinds = ", ".join(dict.fromkeys(item.kind for item in train))
+        raise ConfigError(
+            "`refresh` replaces scenes of families, and data.train has no item of kind family or "
+            f"family_stream, only {kinds} ({place}.refresh)"
+        )
 
 
 def _check_generation(method: BlackBoxMethod, place: str) -> None:

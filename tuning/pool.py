@@ -47,13 +47,12 @@ class Pool:
 
     Args:
         problem: The objective over the windows of the data.
-        data: What these were made from.
+        data: What these were made from; there is a family among it.
         spec: How many scenes are replaced, and when.
         seed: Of the new scenes.
 
     Raises:
-        ConfigError: no scenes of a family among the training data; windows that are split between
-            processes.
+        ConfigError: windows that are split between processes.
     """
 
     def __init__(self, problem: Problem, data: DataSpec, spec: RefreshSpec, seed: int) -> None:
@@ -150,11 +149,6 @@ def _slots_of(problem: Problem, data: DataSpec) -> tuple[list[_Slot], list[list[
             by_scene.setdefault((sample.item, sample.origin), []).append(sample)
         else:
             others.append(sample)
-    if not by_scene:
-        raise ConfigError(
-            "`refresh` replaces scenes of families, and data.train has no item of kind family or "
-            "family_stream"
-        )
     slots = [
         _Slot(key, families[key], sum(sample.weight for sample in windows))
         for (key, _), windows in by_scene.items()

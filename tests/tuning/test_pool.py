@@ -139,8 +139,9 @@ class TestPool:
         assert now.samples[1] is problem.samples[1]
 
     def test_nothing_to_draw_from(self):
-        with pytest.raises(ConfigError, match=r"`refresh` replaces scenes of families, and data"):
-            pool_of(config_of([SCENE]))
+        message = r"`refresh` replaces scenes of families.*only scene \(methods\.0\.refresh\)"
+        with pytest.raises(ConfigError, match=message):
+            config_of([SCENE])
 
     def test_not_with_torchrun(self):
         config = config_of()
