@@ -17,6 +17,7 @@ import typer
 from typer.core import TyperGroup
 
 from tuning.bench_command import bench
+from tuning.card_command import card
 from tuning.console import metrics_table, print_error, print_warning, results, show_progress
 from tuning.crossfit_command import crossfit
 from tuning.evidence_commands import ablate, study
@@ -328,6 +329,7 @@ def compare(
 
 
 app.command()(export)
+app.command()(card)
 app.command()(ablate)
 app.command()(study)
 app.command()(race)

@@ -28,6 +28,7 @@ COMMANDS = (
     "render",
     "compare",
     "export",
+    "card",
     "ablate",
     "study",
     "race",
