@@ -8,12 +8,15 @@ from planted import FIXED, planted_case
 from planted_sequences import sequence_case
 
 from torchblur.filters import get_filter
-from tuning.config import ObjectiveSpec
+from torchblur.params import build
+from tuning.cluster_problem import ClusterProblem
+from tuning.config import ObjectiveSpec, TuneConfig, resolve
 from tuning.data_config import Crops
 from tuning.distributed_problem import Shard, ShardedProblem
 from tuning.fidelity import Ladder, rung_sizes
 from tuning.groups import FrameGroup
 from tuning.method_config import PruningSpec
+from tuning.preparation import prepare
 from tuning.problem import Problem
 from tuning.smaller import pixels_of, smaller
 from tuning.windows import make_samples
@@ -156,3 +159,21 @@ def test_parts_split_between_ranks():
         want = plain.mean(values, count)
         torch.testing.assert_close(sharded.mean(values, count), want, rtol=1e-6, atol=0)
     assert [sample.size for sample in sharded.samples] == [(24, 32)] * 3
+
+
+def _each(problem, values):
+    return problem.each(values)
+
+
+def test_parts_on_the_workers_of_a_cluster(planted_folders, monkeypatch):
+    """A worker cuts the same parts out of the windows that it has loaded itself."""
+    monkeypatch.setattr("tuning.cluster_problem.share_cores", lambda: None)
+    config = resolve(build(TuneConfig, planted_folders))
+    problem = prepare(config).problem
+    here = type("Here", (), {"map": lambda self, work, items: [work(item) for item in items]})()
+    values = {"kappa": 3.0, "third_gain": 2.0, "direction_exponent": 1.0}
+    whole = ClusterProblem(here, config, problem)
+    for crop in (0.5, None):
+        (found,) = whole.subset([0], crop).map(_each, [values])
+        assert torch.equal(found, problem.subset([0], crop).each(values))
+    assert not torch.equal(found, whole.subset([0], 0.5).map(_each, [values])[0])
