@@ -96,6 +96,11 @@ assert torchblur.create_filter("guertin2014", num_samples=5)(moving_square()).sh
     assert done.returncode == 0, done.stderr
 
 
+def test_our_own_filter_is_the_default():
+    assert create_filter().name == "torchblur"
+    assert create_filter(num_samples=8).config.num_samples == 8
+
+
 def test_public_names_exist():
     for name in torchblur.__all__:
         assert getattr(torchblur, name) is not None

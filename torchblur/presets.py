@@ -21,7 +21,10 @@ from torchblur.ops.compiling import EngineChoice
 from torchblur.ops.gather import Storage
 from torchblur.params import Config, build
 
-__all__ = ["Preset", "create_filter", "load_preset", "save_preset"]
+__all__ = ["DEFAULT_FILTER", "Preset", "create_filter", "load_preset", "save_preset"]
+
+DEFAULT_FILTER = "torchblur"
+"""The best on scenes that nothing was fitted to; docs/crossfit.md has the figures."""
 
 
 class Preset(Config):
@@ -72,7 +75,7 @@ def save_preset(
 
 
 def create_filter(
-    name_or_preset: str | Path,
+    name_or_preset: str | Path = DEFAULT_FILTER,
     *,
     engine: EngineChoice = "auto",
     storage: Storage = "full",
@@ -81,7 +84,8 @@ def create_filter(
     """Make a filter from its name or from a preset file.
 
     Args:
-        name_or_preset: A registered name ("guertin2014"), or the path of a preset.
+        name_or_preset: A registered name ("guertin2014"), or the path of a preset; torchblur's own
+            filter if left out.
         engine: "auto", "eager" or "compiled"; see `BlurFilter`.
         storage: "full" or "half"; see `BlurFilter`.
         **params: Single parameters over the preset's: ``num_samples=15, kappa=30.0``.
