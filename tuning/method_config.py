@@ -65,7 +65,7 @@ class RefreshSpec(Config):
         ge=2,
         description="samples per pixel of the new references; their noise averages out over "
         "steps: it adds no bias to the gradient of squared errors, a small one to that of the "
-        "others (absolute errors, FLIP, SSIM)",
+        "others (absolute and relative errors, FLIP, SSIM)",
     )
 
 

@@ -5,8 +5,9 @@ the whole family, but a reference costs as much as many gradient steps. So the s
 are kept for a while: every so many steps some of them are replaced, in turn, by new ones, with
 references of fewer samples. The noise of such a reference changes with each scene and averages out
 over steps: with squared errors it adds nothing to the gradient but its own noise, which has no
-bias; absolute errors, FLIP and SSIM are not linear in the reference, and so their gradient has a
-small bias. What the fit is judged by at its end are the windows of the data, with all samples.
+bias. The gradients of absolute and relative errors, FLIP and SSIM are not linear in the reference,
+and have a small bias. What the fit is judged by at its end are the windows of the data, with all
+samples.
 
 Which scenes a step sees depends on the seed and the step's number alone, and rendered scenes are
 cached, so that a run that was killed goes on with the same ones.
