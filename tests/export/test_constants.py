@@ -94,12 +94,15 @@ class TestShaders:
 
     def test_head_and_comments(self, repository):
         path = repository / "configs" / "filters" / "guertin2014-tuned.yaml"
-        text = constants_text(load_preset(path), "glsl", name=path.name)
+        preset = load_preset(path)
+        text = constants_text(preset, "glsl", name=path.name)
         head = text.split("\n\n")[0]
+        figures = preset.evidence["figures"]["holdout"]
+        before, after = (f"{figures[name]['flip']:.5f}" for name in ("default", "tuned"))
         assert "guertin2014, guertin2014-tuned.yaml; written by torchblur 0.1.0" in head
-        assert "hold-out frames, published -> tuned: flip 0.05956 -> 0.03942" in head
-        assert "Made by: torchblur tune configs/tune/demo.yaml" in head
-        assert "const float blur_kappa = 6.10008;  // published: 40.0\n" in text
+        assert f"hold-out frames, published -> tuned: flip {before} -> {after}" in head
+        assert "Made by: torchblur tune configs/tune/guertin2014.yaml" in head
+        assert f"const float blur_kappa = {preset.params['kappa']};  // published: 40.0\n" in text
         assert "[kappa; 1 to 1000]" in text
         assert (
             "#define blur_noise 2  // none of 0 halton, 1 gradient, 2 none; published: halton"
