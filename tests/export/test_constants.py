@@ -92,13 +92,19 @@ class TestShaders:
         for name, number in numbers.items():
             assert float(values[name]) == number
 
+    def test_head_of_a_quality_level(self):
+        figures = {"holdout": {"default": {"flip": 0.05}, "low": {"flip": 0.04}}}
+        preset = Preset(filter="line", evidence={"figures": figures})
+        head = constants_text(preset, "glsl").split("\n\n")[0]
+        assert "hold-out frames, published -> tuned: flip 0.05 -> 0.04." in head
+
     def test_head_and_comments(self, repository):
         path = repository / "configs" / "filters" / "guertin2014-tuned.yaml"
         preset = load_preset(path)
         text = constants_text(preset, "glsl", name=path.name)
         head = text.split("\n\n")[0]
         figures = preset.evidence["figures"]["holdout"]
-        before, after = (f"{figures[name]['flip']:.5f}" for name in ("default", "tuned"))
+        before, after = (f"{figures[name]['flip']:.4g}" for name in ("default", "tuned"))
         assert "guertin2014, guertin2014-tuned.yaml; written by torchblur 0.1.0" in head
         assert f"hold-out frames, published -> tuned: flip {before} -> {after}" in head
         assert "Made by: torchblur tune configs/tune/guertin2014.yaml" in head

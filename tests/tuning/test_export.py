@@ -8,7 +8,7 @@ from tiny_shots import moving_square
 from typer.testing import CliRunner
 
 from torchblur.frame import Frame
-from torchblur.presets import create_filter
+from torchblur.presets import create_filter, load_preset
 from tuning.commands import app
 
 
@@ -44,7 +44,8 @@ def test_constants(tmp_path, preset, file, options, begins):
     text = path.read_text()
     assert text.startswith(begins)
     name = "MB_kappa" if options[:1] == ["--prefix"] else "blur_kappa"
-    assert ('"value": 6.10008' if file == "a.json" else f" float {name} = 6.10008;") in text
+    kappa = load_preset(preset).params["kappa"]
+    assert (f'"value": {kappa}' if file == "a.json" else f" float {name} = {kappa};") in text
 
 
 def test_a_filter_as_published_and_changed(tmp_path):

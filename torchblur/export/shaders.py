@@ -98,7 +98,8 @@ def _figures(split: Any) -> str:
     """Return "flip 0.0596 -> 0.0394, …", or nothing if the figures are of another form."""
     if not isinstance(split, Mapping):
         return ""
-    before, after = split.get("default"), split.get("tuned")
+    others = [value for name, value in split.items() if name != "default"]
+    before, after = split.get("default"), others[0] if len(others) == 1 else split.get("tuned")
     if not isinstance(before, Mapping) or not isinstance(after, Mapping):
         return ""
     both = [m for m in _SHOWN if _is_number(before.get(m)) and _is_number(after.get(m))]
