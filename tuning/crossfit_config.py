@@ -17,10 +17,18 @@ from torchblur.io import load_yaml
 from torchblur.ops.compiling import EngineChoice
 from torchblur.params import Config, build, declared
 from tuning.config import FilterSpec, FreeRange, TuneConfig, resolve, resolve_filter
-from tuning.data_config import Crops, DataItem
+from tuning.data_config import (
+    Crops,
+    DataItem,
+    FamilyData,
+    FamilyStreamData,
+    SceneData,
+    SceneStreamData,
+)
 from tuning.method_config import Method
 from tuning.objective_config import ObjectiveSpec
 from tuning.overrides import apply_overrides
+from tuning.rendering import find_scene
 
 __all__ = [
     "Bootstrap",
@@ -41,7 +49,10 @@ class CrossfitData(Config):
     cases: dict[str, Annotated[tuple[DataItem, ...], Field(min_length=1)]] = Field(
         min_length=2, description="by name: the frames of one scene, which are left out together"
     )
-    always: tuple[DataItem, ...] = Field((), description="fitted every time, never scored")
+    always: tuple[DataItem, ...] = Field(
+        (),
+        description="fitted every time, never scored; a scene or family of `configs/` by its name",
+    )
     crops: Crops | None = Field(None, description="fit on windows; on full frames if left out")
 
 
@@ -157,7 +168,12 @@ def load_crossfit_config(path: str | Path, overrides: Sequence[str] = ()) -> Cro
     root = (Path.cwd() if own_root else path.parent) / config.data.root
     config = config.model_copy(
         update={
-            "data": config.data.model_copy(update={"root": str(root.resolve())}),
+            "data": config.data.model_copy(
+                update={
+                    "root": str(root.resolve()),
+                    "always": tuple(_found(item, root) for item in config.data.always),
+                }
+            ),
             "filters": {
                 name: _resolved(config, name, str(path), path.parent) for name in config.filters
             },
@@ -171,6 +187,15 @@ def load_crossfit_config(path: str | Path, overrides: Sequence[str] = ()) -> Cro
     for name, case in config.folds:
         config.fold(name, case, f"{path}: filters.{name}, without {case!r}")
     return config
+
+
+def _found(item: DataItem, root: Path) -> DataItem:
+    """Return an item whose scene or family is a file."""
+    if not isinstance(item, (SceneData, FamilyData, SceneStreamData, FamilyStreamData)):
+        return item
+    path = root / item.path
+    found = path if path.is_file() else find_scene(item.path)
+    return item.model_copy(update={"path": str(found.resolve())})
 
 
 def _resolved(config: CrossfitConfig, name: str, place: str, folder: Path) -> CrossfitEntry:

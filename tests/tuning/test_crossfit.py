@@ -4,6 +4,7 @@ import csv
 import dataclasses
 import itertools
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -147,6 +148,16 @@ class TestFolds:
             assert [one.path for one in fold.data.train] == [other, "three"]
             assert [one.path for one in fold.data.holdout] == [case]
         assert config.fold("guertin", "one").data.train[1].weight == 2.0
+
+    def test_always_may_name_a_family(self, finished):
+        def change(data, path="everyday"):
+            data["data"]["always"] = [{"kind": "family", "path": path, "scenes": 1}]
+
+        item = loaded(finished.root, change, "family.yaml").fold("guertin", "one").data.train[-1]
+        assert item.path.endswith("configs/families/everyday.yaml")
+        assert Path(item.path).is_file()
+        with pytest.raises(ConfigError, match="no scene `everydey`; did you mean `everyday`"):
+            loaded(finished.root, lambda data: change(data, "everydey"), "typo.yaml")
 
     def test_weights_are_of_the_fit_alone(self, finished):
         def change(data):
