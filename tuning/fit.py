@@ -311,9 +311,10 @@ def _versions() -> dict[str, str]:
 
 
 def _command() -> str:
+    """Return the command of this process, without what only says how it begins."""
     program = Path(sys.argv[0]).name
     words = ["python", "-m", "tuning"] if program == "__main__.py" else [program]
-    return shlex.join([*words, *sys.argv[1:]])
+    return shlex.join([*words, *(w for w in sys.argv[1:] if w not in ("--resume", "--overwrite"))])
 
 
 def _data_reporter(progress: Progress | None) -> Any:

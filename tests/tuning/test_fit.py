@@ -258,6 +258,12 @@ class TestRun:
         other = config.model_copy(update={"seed": 6})
         assert run_fit(other, tmp_path / "other").methods[1].params != one.methods[1].params
 
+    def test_command_that_makes_it_again(self, config, tmp_path, monkeypatch):
+        words = "/bin/torchblur tune a.yaml --resume -o runs/a --set seed=2 --overwrite".split()
+        monkeypatch.setattr("sys.argv", words)
+        result = run_fit(config, tmp_path / "run")
+        assert result.command == "torchblur tune a.yaml -o runs/a --set seed=2"
+
     def test_holdout_has_no_say(self, planted_folders, tmp_path, finished):
         planted_folders["data"]["holdout"] = []
         without = run_fit(build(TuneConfig, planted_folders), tmp_path / "without")
