@@ -41,6 +41,7 @@ SHARED_PARAMETERS = (
 )
 """Parameters of the taps and of their sums: sets of them share one frame."""
 
+_LEAST_SUM = 1e-30  # of weights: the gradient of a division by less is not finite
 _PARAMETERS = ("depth_level", "spread_offset", "spread_slope", "direction_exponent", "area_slope")
 
 
@@ -276,7 +277,7 @@ def _separate(
     With v for a valid background the whole is ``α fg + (1 − α) (v bg + (1 − v) sharp)``; what
     is not the sharp color leaves here, with its share ``α + v − α v``.
     """
-    has_foreground = total.foreground > 0
+    has_foreground = total.foreground > _LEAST_SUM
     foreground = total.foreground_color / torch.where(has_foreground, total.foreground, 1.0)
     alpha = torch.where(has_foreground, alpha, 0.0)
     center = values.center_weight / (2 * num_pairs(values))
@@ -284,8 +285,8 @@ def _separate(
         center = center * frame.valid.to(frame.dtype)
     weight = total.background + center
     background = total.background_color + center * frame.color
-    background = background / torch.where(weight > 0, weight, 1.0)
-    blurred = (total.background > 0).to(frame.dtype)
+    background = background / torch.where(weight > _LEAST_SUM, weight, 1.0)
+    blurred = (total.background > _LEAST_SUM).to(frame.dtype)
     if values.background_fade > 0:
         blurred = saturate(total.background / values.background_fade, values.softness)
     output = alpha + blurred * (1 - alpha)
@@ -299,7 +300,7 @@ def _separate(
 def _combined(frame: Frame, total: Sums, alpha: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Return the same from one sum, over the pixel's own color."""
     weight = total.background + total.foreground
-    some = weight > 0
+    some = weight > _LEAST_SUM
     blurred = (total.background_color + total.foreground_color) / torch.where(some, weight, 1.0)
     alpha = torch.where(some, alpha, 0.0)
     share = alpha
