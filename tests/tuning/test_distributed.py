@@ -93,7 +93,6 @@ def test_two_ranks_end_where_one_process_does_even_if_one_is_killed(config, one_
     os.kill(rank_process(process.pid, 1), signal.SIGKILL)
     code, out, err = ended(process)
     assert code == 0, err
-    assert "error: another rank is gone" in err  # says rank 0 of the first attempt
     assert out.count("preset:") == 1  # rank 0 alone prints
     torch.testing.assert_close(losses(folder), losses(one_process), rtol=1e-6, atol=0)
     found, want = (load_preset(f / "preset.yaml").params for f in (folder, one_process))
