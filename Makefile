@@ -3,7 +3,11 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 
-.PHONY: help demo test lint bench images clean
+# The fits whose presets and cards are shipped. Rendering and fitting takes about an hour on two cores.
+FITS := guertin2014 mcguire2012 sousa2013 jimenez2014 notes2025 tan2022 torchblur warp stream \
+        pareto-guertin2014 pareto-notes2025
+
+.PHONY: help demo test lint bench images presets clean
 
 help:
 	@echo "make demo   tune Guertin's filter on procedural scenes; report in runs/demo/report.html"
@@ -11,6 +15,7 @@ help:
 	@echo "make lint   format, lint, types, import contracts"
 	@echo "make bench  time filters and memory (leave the machine alone meanwhile)"
 	@echo "make images the pictures of the README"
+	@echo "make presets fit and write all presets that are shipped, and their cards (an hour)"
 
 # torch comes first and by its exact version; its range in pyproject.toml is for other set-ups.
 $(VENV)/.base: constraints.txt
@@ -45,6 +50,13 @@ bench: $(VENV)/.tune
 
 images: $(VENV)/.tune
 	$(BIN)/python -m tuning.pictures
+
+presets: $(FITS:%=runs/%/result.json)
+	$(BIN)/torchblur card $(FITS:%=runs/%) -o docs/presets --presets configs/filters --overwrite
+
+# A run that was stopped goes on; after a change of its configuration remove its folder.
+runs/%/result.json: configs/tune/%.yaml | $(VENV)/.tune
+	$(BIN)/torchblur tune $< -o runs/$* --resume
 
 clean:
 	rm -rf $(VENV) runs out

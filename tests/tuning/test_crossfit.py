@@ -156,7 +156,7 @@ class TestFolds:
         item = loaded(finished.root, change, "family.yaml").fold("guertin", "one").data.train[-1]
         assert item.path.endswith("configs/families/everyday.yaml")
         assert Path(item.path).is_file()
-        with pytest.raises(ConfigError, match="no scene `everydey` .did you mean `everyday`"):
+        with pytest.raises(ConfigError, match=r"no scene `everydey` .did you mean `everyday`"):
             loaded(finished.root, lambda data: change(data, "everydey"), "typo.yaml")
 
     def test_weights_are_of_the_fit_alone(self, finished):
