@@ -53,7 +53,7 @@ def main() -> None:
 def tuned_beside_published(
     scene_name: str, size: tuple[int, int] = (180, 320), spp: int = 256
 ) -> Image.Image:
-    """Return one scene as seen sharp, by three filters, and by the reference, side by side.
+    """Return one scene as seen sharp, by four filters, and by the reference, side by side.
 
     Args:
         scene_name: A scene of configs/scenes, without its ending.
@@ -68,6 +68,7 @@ def tuned_beside_published(
             "line blur": get_filter("line")()(frame),
             "Guertin 2014, as published": get_filter("guertin2014")()(frame),
             "Guertin 2014, tuned": create_filter(_FILTERS / "guertin2014-tuned.yaml")(frame),
+            "torchblur": get_filter("torchblur")()(frame),
             "reference": render_reference(scene, size, spp=spp).mean,
         }
     )
