@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 
 # The fits whose presets and cards are shipped. Rendering and fitting takes about an hour on two cores.
-FITS := guertin2014 mcguire2012 sousa2013 jimenez2014 notes2025 tan2022 torchblur warp \
+FITS := guertin2014 mcguire2012 sousa2013 jimenez2014 notes2025 tan2022 torchblur warp stream \
         pareto-guertin2014 pareto-notes2025
 
 .PHONY: help demo test lint bench images presets clean

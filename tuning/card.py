@@ -19,7 +19,7 @@ from tuning.page import Row, Table
 from tuning.pareto_files import front_method
 from tuning.pareto_report import front_section
 from tuning.pareto_result import ParetoResult
-from tuning.report import figures_table
+from tuning.report import default_label, figures_table
 from tuning.result import FitResult, ParameterResult
 
 __all__ = ["Card", "card_text"]
@@ -29,7 +29,6 @@ _LABELS = {
     "sharp": "sharp",
     "input": "the stream as it is",
     "line": "line blur",
-    "default": "as published",
     "start": "where the fit began",
     "noise": "a perfect image",
 }
@@ -67,6 +66,11 @@ class Card:
     variant: str
 
     @property
+    def rival(self) -> str:
+        """What the filter with its default values is called."""
+        return default_label(self.preset.filter)
+
+    @property
     def label(self) -> str:
         """What the preset is called in tables."""
         return f"`{self.name}`"
@@ -85,7 +89,7 @@ def card_text(card: Card, used: str, picture: str, caption: str, plot: str | Non
     parts = [
         f"# {card.name}",
         _head(card, used),
-        f"![sharp, line blur, as published, {card.name}, reference]({picture})",
+        f"![sharp, line blur, {card.rival}, {card.name}, reference]({picture})",
         caption,
         *_figures(card),
         *_worse(card),
@@ -134,11 +138,12 @@ def _figures(card: Card) -> list[str]:
 
 
 def _is_shown(name: str, card: Card) -> bool:
-    return name in _LABELS or name == card.variant
+    return name in (*_LABELS, "default", card.variant)
 
 
 def _named(row: Row, card: Card) -> Row:
-    name = card.label if row.name == card.variant else _LABELS[row.name]
+    names = _LABELS | {"default": card.rival, card.variant: card.label}
+    name = names[row.name]
     return Row(name=name, values=row.values, ranked=row.ranked)
 
 
@@ -176,7 +181,7 @@ def _worse(card: Card) -> list[str]:
         if cases:
             counts.append(f"{len(worse)} of {len(cases)} {label.lower()} frames")
     rivals = " or ".join(
-        {"default": "the filter as published", "line": "the line blur"}[name]
+        {"default": f"the filter {card.rival}", "line": "the line blur"}[name]
         for name in _RIVALS
         if name in card.result.variants()
     )
@@ -200,8 +205,9 @@ def _loss(found: _Figures, card: Card, key: str) -> str:
     mine, sign = found[card.variant].get(key), -1 if less else 1
     if mine is None:
         return ""
+    names = {"default": card.rival, "line": _LABELS["line"]}
     better = [
-        f"{_LABELS[name]} {value:.{digits}f}"
+        f"{names[name]} {value:.{digits}f}"
         for name in _RIVALS
         if name in found
         and (value := found[name].get(key)) is not None
@@ -227,18 +233,18 @@ def _level(card: Card, plot: str | None) -> list[str]:
         "## Among the levels",
         f"The best of {section.tried} settings that cost at most {pick.budget:g} of Guertin 2014 "
         "with 35 taps. Cost is counted from the configuration: lookups, arithmetic and passes. "
-        + _beside_published(method.pareto),
+        + _beside_published(method.pareto, card.rival),
         _markdown(Table(title="", columns=section.presets.columns, rows=rows)),
         *shown,
     ]
 
 
-def _beside_published(found: ParetoResult) -> str:
-    """Return what the front pays for the quality of the filter as published."""
+def _beside_published(found: ParetoResult, label: str) -> str:
+    """Return what the front pays for the quality of the filter with its default values."""
     published = next(mark for mark in found.landmarks if mark.origin == "published")
     front = [found.point(number) for number in found.front]
     costs = [point.cost for point in front if point.objective <= published.objective]
-    dearer = f"As published the filter costs {published.cost:.3g}; "
+    dearer = f"{label[0].upper()}{label[1:]} the filter costs {published.cost:.3g}; "
     if not costs:
         return dearer + "no setting that was tried is as good on the training frames."
     return dearer + (
@@ -248,8 +254,8 @@ def _beside_published(found: ParetoResult) -> str:
 
 
 def _parameters(card: Card) -> list[str]:
-    config_class = get_filter(card.preset.filter).config_class
-    specs, default = declared(config_class), config_class()
+    of = get_filter(card.preset.filter)
+    specs, default = declared(of.config_class), of.config_class()
     free = {parameter.name: parameter for parameter in card.result.parameters}
     rows = []
     for name in [n for n in specs if n in free or n in card.preset.params]:
@@ -258,7 +264,8 @@ def _parameters(card: Card) -> list[str]:
         unit = "" if spec.unit == "1" else spec.unit
         cells = (f"`{name}`", _value(published), _value(value), unit, _range(free.get(name)))
         rows.append([*cells, spec.meaning])
-    head = ["", "published", "here", "unit", "range of the fit", "meaning"]
+    origin = "published" if of.published else "default"
+    head = ["", origin, "here", "unit", "range of the fit", "meaning"]
     return ["## Parameters", _rows(head, rows), *_lengths(card, list(free))]
 
 

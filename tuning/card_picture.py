@@ -40,11 +40,11 @@ class CardPicture:
 
 @torch.no_grad()
 def card_picture(card: Card, cases: Sequence[AnyCase]) -> CardPicture:
-    """Return crops of two frames: sharp, line blur, as published, the preset, the reference.
+    """Return crops of two frames: sharp, line blur, the defaults, the preset, the reference.
 
     The frames are those of the hold-out (of the training, if there is none) where FLIP is best and
-    worst over that of the filter as published or of the line blur, whichever is better; the crops
-    lie where that difference is greatest.
+    worst over that of the filter with its defaults or of the line blur, whichever is better; the
+    crops lie where that difference is greatest.
 
     Args:
         card: The preset, and the figures of all frames.
@@ -85,7 +85,7 @@ def _ratio(card: Card, case: str) -> float | None:
 
 
 def _flips(card: Card, case: str) -> str:
-    names = {"line": "line blur", "default": "as published", card.variant: card.variant}
+    names = {"line": "line blur", "default": card.rival, card.variant: card.variant}
     values = [(label, _flip(card, case, name)) for name, label in names.items()]
     return ", ".join(f"{label} {value:.4f}" for label, value in values if value is not None)
 
@@ -101,7 +101,7 @@ def _row(card: Card, case: AnyCase, *, best: bool) -> dict[str, Tensor]:
     variants = {
         "sharp": Variant(name="sharp"),
         "line blur": Variant(name="line", blur=get_filter("line")()),
-        "as published": Variant(name="default", blur=get_filter(kind)()),
+        card.rival: Variant(name="default", blur=get_filter(kind)()),
         card.variant: Variant(
             name="mine", blur=get_filter(kind)(**params), values=values, free=free
         ),
@@ -110,7 +110,7 @@ def _row(card: Card, case: AnyCase, *, best: bool) -> dict[str, Tensor]:
         variants["sharp"] = Variant(name="input", stream=True)
     images = {label: _image(variant, case) for label, variant in variants.items()}
     images["reference"] = _reference(case)
-    place = _place(images, card.variant, best=best)
+    place = _place(images, card, best=best)
     return {label: _crop(display_encode(image)[0], place) for label, image in images.items()}
 
 
@@ -129,13 +129,12 @@ def _middle(case: AnyCase) -> int:
     return (case.warm_up + len(case)) // 2
 
 
-def _place(images: Mapping[str, Tensor], mine: str, *, best: bool) -> tuple[int, int]:
+def _place(images: Mapping[str, Tensor], card: Card, *, best: bool) -> tuple[int, int]:
     """Return top and left of the crop where a preset's gain, or its loss, is greatest."""
     reference = images["reference"]
-    errors = {
-        label: flip_ldr(images[label], reference) for label in ("as published", "line blur", mine)
-    }
-    rival = min(("as published", "line blur"), key=lambda label: float(errors[label].mean()))
+    mine, rivals = card.variant, (card.rival, "line blur")
+    errors = {label: flip_ldr(images[label], reference) for label in (*rivals, mine)}
+    rival = min(rivals, key=lambda label: float(errors[label].mean()))
     change = errors[rival] - errors[mine] if best else errors[mine] - errors[rival]
     height, width = reference.shape[-2:]
     edge = (min(_CROP_PX, height), min(_CROP_PX, width))

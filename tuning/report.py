@@ -11,6 +11,7 @@ from typing import Any
 import torch
 from markupsafe import Markup
 
+from torchblur.filters import get_filter
 from torchblur.params import Param
 from tuning.cases import AnyCase, SequenceCase
 from tuning.config import TuneConfig
@@ -23,7 +24,7 @@ from tuning.sensitivity_rows import slope_rows
 from tuning.sequence_plots import score_curves
 from tuning.variants import Variant, render, render_frames
 
-__all__ = ["Verdict", "figures_table", "verdict_of", "write_report"]
+__all__ = ["Verdict", "default_label", "figures_table", "verdict_of", "write_report"]
 
 _MAX_VIEWS = 8
 _METRICS = {
@@ -42,7 +43,6 @@ _NOTES = {
     "sharp": "no filter",
     "input": "the stream as it is",
     "line": "line blur along each pixel's own motion",
-    "default": "as published",
     "start": "before the fit: the fixed values of the config",
     "tuned": "after the fit",
     "ceiling": "parameters fitted to each frame alone",
@@ -154,6 +154,11 @@ def _at_borders(result: FitResult, split: str) -> str:
     return text if math.isnan(line) else f"{text}; the line blur has {line:.4f} there"
 
 
+def default_label(kind: str) -> str:
+    """Return what a filter with its default values is called."""
+    return "as published" if get_filter(kind).published else "with its defaults"
+
+
 def figures_table(result: FitResult, split: str) -> Table | None:
     """Return the means of all variants over a split, or None if it has no frames.
 
@@ -169,7 +174,7 @@ def figures_table(result: FitResult, split: str) -> Table | None:
         Row(
             name=variant,
             values=[result.mean(variant, split, metric) for metric in columns],
-            note=_NOTES.get(variant, ""),
+            note=default_label(result.filter) if variant == "default" else _NOTES.get(variant, ""),
             ranked=variant not in _UNRANKED,
             strong=variant == "tuned",
         )

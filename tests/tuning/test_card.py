@@ -1,6 +1,7 @@
 """Cards of presets: figures of the run and nothing else, honest about what is worse."""
 
 import io
+from dataclasses import replace
 
 import pytest
 import torch
@@ -55,6 +56,16 @@ def card_of(run, **changes):
         result=result.model_copy(update=changes),
         variant="tuned",
     )
+
+
+def test_defaults_that_no_paper_has_are_not_called_published(run):
+    published, own = card_of(run), card_of(run, filter="warp", parameters=())
+    own = replace(own, preset=own.preset.model_copy(update={"filter": "warp", "params": {}}))
+    for card, label in ((published, "as published"), (own, "with its defaults")):
+        text = card_text(card, "used", "picture", "")
+        assert card.rival == label
+        assert f"| {label} |" in section(text, "Before and after")
+        assert ("published" in text) == (card is published)
 
 
 def section(text, title):

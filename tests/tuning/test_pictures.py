@@ -6,7 +6,7 @@ from tuning.pictures import one_sample_per_pixel, tuned_beside_published, what_l
 @pytest.mark.parametrize(
     ("make", "columns"),
     [
-        (lambda: tuned_beside_published("fence", size=(18, 32), spp=2), 5),
+        (lambda: tuned_beside_published("fence", size=(18, 32), spp=2), 6),
         (lambda: what_lies_behind(size=(18, 32), spp=2), 5),
         (lambda: one_sample_per_pixel(size=(18, 32), spp=2, frames=2), 4),
     ],

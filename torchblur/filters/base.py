@@ -83,6 +83,8 @@ class BlurFilter(ConfiguredModule):
 
     config_class: ClassVar[type[FilterConfig]]
     config: FilterConfig
+    published: ClassVar[bool] = True
+    """Whether the defaults are those of a paper; else they are ours."""
     needs: ClassVar[tuple[str, ...]] = ()
     """Layers without which the filter cannot run, beside color and velocity."""
     per_frame: ClassVar[tuple[str, ...] | None] = None

@@ -87,6 +87,7 @@ class ComposedBlur(BlurFilter):
     """
 
     name = "torchblur"
+    published = False
     config_class = ComposedConfig
 
     def engine_for(self, pixels: float) -> Engine:

@@ -91,6 +91,7 @@ class LineBlur(BlurFilter):
     """
 
     name = "line"
+    published = False
     config_class = LineConfig
     per_frame = ()
 

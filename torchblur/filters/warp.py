@@ -112,6 +112,7 @@ class WarpBlur(BlurFilter):
     """
 
     name = "warp"
+    published = False
     config_class = WarpConfig
 
     def compute(self, frame: Frame, values: Values) -> dict[str, Tensor]:
