@@ -88,6 +88,45 @@ def test_what_moves_alone_gives_what_all_pixels_give(monkeypatch, name, batch_si
         assert torch.allclose(sparse, dense, rtol=1e-5, atol=1e-6)
 
 
+@pytest.mark.parametrize("lookup", ["nearest", "bilinear"])
+@pytest.mark.parametrize("batch_size", [1, 2])
+@pytest.mark.parametrize("name", ["guertin2014", "jimenez2014", "mcguire2012"])
+def test_textures_without_what_no_tap_reaches(monkeypatch, name, batch_size, lookup):
+    """Odd windows, taps on edges of pixels, a layer behind, a parameter per pixel."""
+    double = {"batch_size": batch_size, "dtype": torch.float64}
+    frame = random_frame(61, 143, **double)
+    layer = random_frame(61, 143, speed=0.0, seed=1, **double)
+    layer = dataclasses.replace(layer, depth=layer.depth + 3)
+    velocity = torch.zeros_like(frame.velocity)
+    velocity[0, :, 26:31, 72:77] = torch.tensor([8.0, 6.0], dtype=torch.float64).view(2, 1, 1)
+    velocity[-1, :, 31:36, 102:107] = torch.tensor([-3.0, 0.0], dtype=torch.float64).view(2, 1, 1)
+    frame = dataclasses.replace(frame, velocity=velocity, revealed=layer)
+    options = {"background": "revealed", "color_lookup": lookup, "noise": "none"}
+    blur = get_filter(name)(tile_size=5, num_samples=8, **options).double()
+    shutter = torch.linspace(0.4, 1, 143).expand(1, 1, 61, 143)
+    textures, original = [], gather_module.sum_taps
+    monkeypatch.setattr(
+        gather_module,
+        "sum_taps",
+        lambda *a, **k: textures.append(a[3]["texture"].shape) or original(*a, **k),
+    )
+    results = []
+    for dense in (False, True):
+        if dense:
+            monkeypatch.setattr("torchblur.ops.pixels._DENSE", -1.0)
+            monkeypatch.setattr("torchblur.filters.moving._ALMOST_ALL", -1.0)
+        leaf = frame.color.clone().requires_grad_()
+        textures.clear()
+        image = blur(dataclasses.replace(frame, color=leaf), shutter=shutter)
+        image.square().sum().backward()
+        results.append([image.detach(), leaf.grad])
+        smaller = [shape[1] < 61 * batch_size and shape[2] < 100 for shape in textures]
+        assert not any(smaller) if dense else all(smaller)
+    for sparse, dense in zip(*results, strict=True):
+        assert torch.allclose(sparse, dense, rtol=0, atol=1e-9)
+    assert not torch.equal(results[0][0], frame.color)
+
+
 @pytest.mark.parametrize("kind", ["per image", "per pixel", "sets"])
 @pytest.mark.parametrize("name", ["guertin2014", "jimenez2014", "mcguire2012", "notes2025"])
 def test_parameters_of_all_shapes(monkeypatch, name, kind):

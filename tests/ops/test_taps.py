@@ -156,7 +156,7 @@ def test_parts_and_groups_of_taps_change_nothing(monkeypatch, sets, with_texture
     inputs = list_inputs(sets, 103)
     results = []
     for part, taps in ((1 << 16, 1), (40, 1), (1 << 16, 4), (30, 3)):
-        monkeypatch.setattr("torchblur.ops.taps._PART", part)
+        monkeypatch.setattr("torchblur.ops.taps._PART", {"eager": part})
         monkeypatch.setattr("torchblur.ops.taps._LEAST_PART", 8)
         monkeypatch.setattr("torchblur.ops.taps._TAPS_PER_CALL", {"cpu": taps})
         leaves = {k: v.clone() for k, v in inputs.items()}
@@ -179,7 +179,7 @@ def test_no_part_is_larger_than_it_may_be(monkeypatch):
         seen.append(inputs["planes"].shape[-1])
         return (inputs["planes"] * inputs["decay"],)
 
-    monkeypatch.setattr("torchblur.ops.taps._PART", 60)
+    monkeypatch.setattr("torchblur.ops.taps._PART", {"eager": 60})
     monkeypatch.setattr("torchblur.ops.taps._LEAST_PART", 8)
     sum_taps(watching, None, 2, list_inputs(3, 103), lists=Lists(103))
     sizes = [size for size in seen if size != 103]  # the first call finds out what it returns

@@ -109,9 +109,7 @@ def _filtered(frame: Frame, values: Values, engine: Engine) -> Filtered:
     if part is None:
         return Filtered.still(frame, tiles, "weight", "moving")
     inputs = _tap_inputs(part, tiles.get("tile_variance"))
-    inputs |= revealed_part(
-        frame, values, part.pixels, lambda f, v: _filtered(f, v, engine).color(f)
-    )
+    inputs |= revealed_part(frame, values, part, lambda f, v: _filtered(f, v, engine).color(f))
     sums = gather_lists(
         _tap,
         _options(values),

@@ -100,9 +100,7 @@ def _filtered(frame: Frame, values: Values, engine: Engine) -> Filtered:
     if part is None:
         return Filtered.still(frame, tiles, "alpha", "tile_class")
     inputs, tile_class = _tap_inputs(part, shortest)
-    inputs |= revealed_part(
-        frame, values, part.pixels, lambda f, v: _filtered(f, v, engine).color(f)
-    )
+    inputs |= revealed_part(frame, values, part, lambda f, v: _filtered(f, v, engine).color(f))
     options = _Options(
         Shutter(1, values.shutter_position).center,
         values.depth_compare == "relative",

@@ -122,9 +122,7 @@ def _filtered(frame: Frame, values: Values, engine: Engine) -> Filtered:
     if part is None:
         return Filtered.still(frame, tiles, "weight")
     inputs = _tap_inputs(part)
-    inputs |= revealed_part(
-        frame, values, part.pixels, lambda f, v: _filtered(f, v, engine).color(f)
-    )
+    inputs |= revealed_part(frame, values, part, lambda f, v: _filtered(f, v, engine).color(f))
     options = _Options(
         Shutter(1, values.shutter_position).center,
         values.skip_middle_tap and values.shutter_position == "centered",

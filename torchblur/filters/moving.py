@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import NamedTuple
 
 import torch
@@ -67,6 +68,32 @@ class Stray(NamedTuple):
     """See `tile_offset`."""
 
 
+class Window(NamedTuple):
+    """A rectangle of whole tiles, px; the last of them may end beyond the image."""
+
+    top: int
+    bottom: int
+    left: int
+    right: int
+
+    @classmethod
+    def around(cls, chosen: Tensor, tile_size: int) -> Window:
+        """Return the smallest one that has all chosen tiles of whatever image.
+
+        Args:
+            chosen: Tiles, bool, (B, 1, Ty, Tx), at least one of them.
+            tile_size: Edge of a tile, px.
+        """
+        ends = [chosen.any(0)[0].any(axis).nonzero() for axis in (1, 0)]
+        rows, columns = ((int(end[0]) * tile_size, int(end[-1] + 1) * tile_size) for end in ends)
+        return cls(*rows, *columns)
+
+    def of(self, plane: Tensor, tile_size: int = 1) -> Tensor:
+        """Return this part of planes (B, C, H, W), or of tiles."""
+        rows = slice(self.top // tile_size, self.bottom // tile_size)
+        return plane[..., rows, self.left // tile_size : self.right // tile_size]
+
+
 class Moving(NamedTuple):
     """The part of a frame that a blur may change, as lists of pixels."""
 
@@ -81,7 +108,9 @@ class Moving(NamedTuple):
     """How far the lookup of the tile strays, in tiles, (P, 2, 1, M)."""
     spread: Spread
     texture: Tensor
-    """What the taps look up, (B, 7 or 8, H, W); zero where none of them reaches."""
+    """What the taps look up, (B, 7 or 8, h, w): the window; zero where none of them reaches."""
+    window: Window | None
+    """The part of the images that taps reach; None: all of it."""
     color_from: int
     """First channel of the texture that may have a gradient: that of the color, or 0."""
 
@@ -130,17 +159,22 @@ def moving_part(
     layers = frame.only("depth", "valid")
     here, local = layers.map(pixels.pack), packed_values(values, pixels)
     spread = pixel_spread(here, local, uint8=uint8)
+    window = None
     if pixels.index is None:
         texture = pixels.unpack(texture_of(here, spread))
     else:
         far = -(-(values.tile_size + margin) // values.tile_size)
-        reached = PixelList.in_tiles(_dilated(wanted, far) > 0, color, values.tile_size)
-        there = layers.map(reached.pack)
-        read = pixel_spread(there, packed_values(values, reached), uint8=uint8)
-        texture = reached.unpack(texture_of(there, read))
+        reached = _dilated(wanted, far) > 0
+        window = Window.around(reached, values.tile_size)
+        there = layers.map(window.of)
+        tiles = window.of(reached, values.tile_size)
+        listed = PixelList.in_tiles(tiles, there.color, values.tile_size)
+        there, read = there.map(listed.pack), packed_values(values, listed, window)
+        texture = listed.unpack(texture_of(there, pixel_spread(there, read, uint8=uint8)))
+        pixels = replace(pixels, origin=(window.top, window.left))
     motion = (frame.velocity, values.shutter, frame.finite_depth())
     color_from = 0 if any(plane.requires_grad for plane in motion) else TEXTURE_COLOR
-    return Moving(pixels, here, local, dominant, shift, spread, texture, color_from)
+    return Moving(pixels, here, local, dominant, shift, spread, texture, window, color_from)
 
 
 def moving_tiles(frame: Frame, values: Values, neighborhood: Tensor) -> Tensor:
@@ -168,20 +202,33 @@ def _moving_pixels(dominant: Tensor, least: Tensor) -> Tensor | None:
 
 
 def revealed_part(
-    frame: Frame, values: Values, pixels: PixelList, blur: Callable[[Frame, Values], Tensor]
+    frame: Frame, values: Values, part: Moving, blur: Callable[[Frame, Values], Tensor]
 ) -> Inputs:
-    """Return `revealed_inputs` with lists of some pixels; arguments as there."""
-    return pixels.lists(revealed_inputs(frame, values, blur))
+    """Return `revealed_inputs` with lists of the part's pixels; other arguments as there."""
+    inputs = revealed_inputs(frame, values, blur)
+    if part.window is not None:
+        textures = {k: part.window.of(v) for k, v in inputs.items() if k.startswith("texture")}
+        inputs = inputs | textures
+    return part.pixels.lists(inputs)
 
 
 def _dilated(mask: Tensor, tiles: int) -> Tensor:
     return F.max_pool2d(mask, 2 * tiles + 1, stride=1, padding=tiles)
 
 
-def packed_values(values: Values, pixels: PixelList) -> Values:
-    """Return the parameters with those that are given per pixel as lists of some pixels."""
-    packed = {
-        key: pixels.pack(value) if isinstance(value, Tensor) else value
-        for key, value in vars(values).items()
-    }
+def packed_values(values: Values, pixels: PixelList, window: Window | None = None) -> Values:
+    """Return the parameters with those that are given per pixel as lists of some pixels.
+
+    Args:
+        values: The parameters.
+        pixels: The pixels, of the images or of a window of them.
+        window: The window.
+    """
+    packed = {}
+    for key, value in vars(values).items():
+        here = value
+        if isinstance(value, Tensor):
+            per_pixel = value.ndim == 4 and value.shape[-2:] != (1, 1)
+            here = pixels.pack(window.of(value) if window is not None and per_pixel else value)
+        packed[key] = here
     return Values(**packed)

@@ -51,7 +51,7 @@ def read_cubic(inputs: Inputs, x: Tensor, y: Tensor, channels: slice) -> Planes:
     Reference: Catmull and Rom 1974. We differ: no term for both axes together, at most 1/64 of a
         mixed difference; the range is kept.
     """
-    last = torch.full_like(x, inputs["texture"].shape[2] - 1), inputs["height"] - 1
+    last = inputs["width"] - 1, inputs["height"] - 1
     x, y = (torch.minimum(p.clamp(min=0), end) for p, end in zip((x, y), last, strict=True))
     # At the last pixel the one before it, so that both borders are alike.
     left, top = (

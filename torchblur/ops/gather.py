@@ -160,21 +160,23 @@ def read(
     Differentiable: in the texture; in the positions with "bilinear" only.
     """
     texture = inputs[name][channels]
-    x = x.clamp(0, texture.shape[2] - 1)
+    x = torch.minimum(x.clamp(min=0), inputs["width"] - 1)
     y = torch.minimum(y.clamp(min=0), inputs["height"] - 1)
+    first_row, first_column = inputs["first_row"], inputs["first_column"]
     if mode == "nearest":
-        return _split(_at(texture, x.round(), y.round() + inputs["first_row"]))
+        return _split(_at(texture, x.round() + first_column, y.round() + first_row))
     compiling = torch.compiler.is_dynamo_compiling() or isinstance(texture, Lookups)
     as_is = not compiling and texture.dtype == x.dtype
     if as_is and texture.shape[1] <= _MOST_ROWS:
-        return _sampled(texture, x, y + inputs["first_row"])
+        return _sampled(texture, x + first_column, y + first_row)
     left, top = x.detach().floor(), y.detach().floor()
-    right = (left + 1).clamp(max=texture.shape[2] - 1)
+    right = torch.minimum(left + 1, inputs["width"] - 1)
     bottom = torch.minimum(top + 1, inputs["height"] - 1)
     dx, dy = x - left, y - top
     rows = []
-    for row in (top + inputs["first_row"], bottom + inputs["first_row"]):
-        pairs = zip(_at(texture, left, row), _at(texture, right, row), strict=True)
+    columns = left + first_column, right + first_column
+    for row in (top + first_row, bottom + first_row):
+        pairs = zip(*(_at(texture, column, row) for column in columns), strict=True)
         rows.append([torch.lerp(a, b, dx) for a, b in pairs])
     return _split(tuple(torch.lerp(a, b, dy) for a, b in zip(*rows, strict=True)))
 

@@ -103,7 +103,7 @@ def interleaved_gradient_noise(
     shift = _FRAME_STRIDE * (seed % 64)
     shift_x, shift_y = shift + 13.0 * stream, shift + 29.0 * stream  # no correlation: measured
     inner = 0.06711056 * (x + shift_x) + 0.00583715 * (y + shift_y)
-    return torch.remainder(52.9829189 * torch.remainder(inner, 1.0), 1.0)
+    return (52.9829189 * inner.frac()).frac()
 
 
 def checkerboard(like: Tensor, pixels: PixelList | None = None) -> Tensor:

@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from contextvars import ContextVar
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -48,9 +48,9 @@ def select(packed: Tensor, chosen: Tensor) -> Tensor:
         packed: The list, (P, C, 1, M).
         chosen: Positions, int64, (m,).
     """
-    # Two dimensions take a fast path that four do not.
-    flat = packed.reshape(-1, packed.shape[3]).index_select(1, chosen)
-    return flat.view(*packed.shape[:3], -1)
+    flat = packed.reshape(-1, packed.shape[3])
+    # Twice as fast as `index_select`.
+    return flat.gather(1, chosen.expand(flat.shape[0], -1)).view(*packed.shape[:3], -1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,11 +61,13 @@ class PixelList:
         batch_size: B, number of images.
         size: Height and width of an image, px.
         index: Positions in the flattened batch, int64, (M,); None: all of them.
+        origin: First row and column of each image that textures have, px.
     """
 
     batch_size: int
     size: tuple[int, int]
     index: Tensor | None = None
+    origin: tuple[int, int] = (0, 0)
 
     @classmethod
     def all(cls, like: Tensor) -> PixelList:
@@ -111,7 +113,7 @@ class PixelList:
             chosen: Positions in this list, int64, (m,).
         """
         index = chosen if self.index is None else self.index[chosen]
-        return PixelList(*self.shape, index)
+        return replace(self, index=index)
 
     @property
     def shape(self) -> tuple[int, tuple[int, int]]:
@@ -131,6 +133,12 @@ class PixelList:
             like: A tensor of the wanted type and device.
         """
         height, width = self.size
+        if self.index is not None:
+            places = self.index.int()  # half the cost of 64 bits
+            row = torch.div(places, width, rounding_mode="floor")
+            column = places - row * width
+            row = row if self.batch_size == 1 else row % height
+            return column.to(like.dtype).view(1, 1, 1, -1), row.to(like.dtype).view(1, 1, 1, -1)
         x = torch.arange(width, device=like.device, dtype=like.dtype).view(1, 1, 1, width)
         y = torch.arange(height, device=like.device, dtype=like.dtype).view(1, 1, height, 1)
         image = (self.batch_size, 1, height, width)
@@ -199,7 +207,7 @@ class PixelList:
         whole = PixelList(*self.shape)
         shape = (*packed.shape[:3], whole.count)
         if not isinstance(over, Tensor):
-            return packed.new_full(shape, over)
+            return packed.new_full((), over).expand(shape)  # `scatter` copies it: one write in all
         return whole.pack(over).expand(shape)
 
     def texture(self, texture: Tensor) -> Tensor:
@@ -207,18 +215,23 @@ class PixelList:
         return texture.transpose(0, 1).reshape(texture.shape[1], -1, texture.shape[3])
 
     def rows(self, like: Tensor) -> dict[str, Tensor]:
-        """Return where the pixels' own images lie in a texture.
+        """Return where in a texture the pixels' own images lie, and their size.
 
         Args:
-            like: A tensor of the wanted type and device.
+            like: A texture before `texture` made it flat, (B, C, h, w).
 
         Returns:
-            "first_row" of each pixel's image, (1, 1, 1, M), and the "height" of all, 0-d.
+            "first_row", that of each pixel's image, (1, 1, 1, M), and "first_column", "height" and
+            "width" of all images, 0-d. Where the texture has only a part of each image, the first
+            row and column are those that the image would have.
         """
-        height = torch.full((), float(self.size[0]), dtype=like.dtype, device=like.device)
+        numbers = (-self.origin[1], *self.size)
+        names = ("first_column", "height", "width")
+        whole = {n: like.new_full((), float(v)) for n, v in zip(names, numbers, strict=True)}
         if self.batch_size > 1:
-            return {"first_row": self.image(like) * height, "height": height}
-        return {"first_row": like.new_zeros(1, 1, 1, self.count), "height": height}
+            return whole | {"first_row": self.image(like) * like.shape[2] - self.origin[0]}
+        shape = (1, 1, 1, self.count)
+        return whole | {"first_row": like.new_full(shape, float(-self.origin[0]))}
 
     def lists(self, inputs: Mapping[str, Tensor]) -> dict[str, Tensor]:
         """Return the inputs of a gather, textures as they are and all else as lists."""

@@ -161,7 +161,7 @@ def ray_mask(
 def _reach_tap(index: Tensor, count: Tensor, inputs: Inputs, options: None) -> tuple[Tensor, ...]:
     dx, dy = (inputs["displacement"] * (index / count)).split(1, 1)
     x, y = inputs["x"] + dx, inputs["y"] + dy
-    inside = _inside(x, y, inputs["height"], inputs["texture"].shape[2])
+    inside = _inside(x, y, inputs["height"], inputs["width"])
     return (read(inputs, x, y)[0] * inside,)
 
 
@@ -171,7 +171,7 @@ def _moved(displacement: Tensor, share: float) -> tuple[Tensor, Tensor]:
     return x + dx, y + dy
 
 
-def _inside(x: Tensor, y: Tensor, height: Tensor | int, width: int) -> Tensor:
+def _inside(x: Tensor, y: Tensor, height: Tensor | int, width: Tensor | int) -> Tensor:
     column, row = x.round(), y.round()
     inside = (column >= 0) & (column <= width - 1) & (row >= 0) & (row <= height - 1)
     return inside.to(x.dtype)

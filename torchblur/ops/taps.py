@@ -37,7 +37,9 @@ from torchblur.ops.tap_kernels import (
 
 __all__ = ["Engine", "Inputs", "Lists", "Planes", "TapFunction", "sum_taps"]
 
-_PART = 1 << 16  # pixels; the planes of so many fill a CPU's cache of the second level
+_PART = {"eager": 1 << 16, "compiled": 1 << 17}
+"""Pixels that a CPU takes through all taps at once: what they need should stay in its caches, which
+is more for an eager tap, and the time of each call should not count."""
 _LEAST_PART = 1 << 10  # pixels; with fewer, calls cost more than what they do
 _TAPS_PER_CALL = {"cpu": 1, "cuda": 4}
 """Taps that one kernel adds: on a GPU each pass over the planes serves several. More of them take
@@ -188,7 +190,8 @@ class _Sum:
         if self.lists.num_pixels is None or like.device.type != "cpu":
             return [None]
         sets = max(shape[0] for shape in self.form.shapes)
-        count = min(-(-self.lists.num_pixels * sets // _PART), self.lists.num_pixels // _LEAST_PART)
+        most = _PART[self.kernel.engine]
+        count = min(-(-self.lists.num_pixels * sets // most), self.lists.num_pixels // _LEAST_PART)
         if count <= 1:
             return [None]
         ends = [self.lists.num_pixels * i // count for i in range(count + 1)]

@@ -183,7 +183,7 @@ def tile_offset(
         this is the one that CryENGINE uses.
     """
     x, y = pixel_grid(like, pixels)
-    along_x = torch.remainder(x + y, 2) == 0
+    along_x = ((x + y) / 2).frac() == 0
     shift = tau * (noise - 0.5)
     shift_x = torch.where(along_x, shift * _edge_distance(x, tile_size), 0.0)
     shift_y = torch.where(along_x, 0.0, shift * _edge_distance(y, tile_size))
@@ -191,7 +191,7 @@ def tile_offset(
 
 
 def _edge_distance(position: Tensor, tile_size: int) -> Tensor:
-    return 2 * (torch.remainder((position + 0.5) / tile_size, 1.0) - 0.5).abs()
+    return 2 * (((position + 0.5) / tile_size).frac() - 0.5).abs()
 
 
 def tile_lookup(
