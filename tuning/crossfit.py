@@ -9,16 +9,12 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
-import multiprocessing
-import os
 from collections.abc import Iterator, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures import as_completed
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
-
-import torch
 
 from torchblur.errors import ConfigError
 from torchblur.filters import get_filter
@@ -37,6 +33,7 @@ from tuning.progress import Progress, Stage
 from tuning.runfolder import open_run
 from tuning.study import slug, source_hash
 from tuning.variants import Variant
+from tuning.worker_pool import worker_pool
 
 __all__ = ["Crossfit", "Fold", "Scored", "run_crossfit"]
 
@@ -157,9 +154,7 @@ def _worked_off(
             _work(config, folder, job)
             yield job
         return
-    threads = max(1, (os.cpu_count() or 1) // workers)
-    context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(workers, context, torch.set_num_threads, (threads,)) as pool:
+    with worker_pool(workers) as pool:
         waiting = {pool.submit(_work, config, folder, job): job for job in jobs}
         try:
             for future in as_completed(waiting):
