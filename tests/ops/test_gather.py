@@ -1,6 +1,7 @@
 import pytest
 import torch
 
+from torchblur.ops import tap_kernels, taps
 from torchblur.ops.gather import gather, lookup, pixel_grid, read, stored_as, weighted
 from torchblur.ops.pixels import PixelList
 
@@ -70,8 +71,13 @@ def test_lists_of_pixels_give_what_images_give(mode, batch_size, sets, share):
         assert torch.allclose(ours, theirs, atol=1e-10)
 
 
-@pytest.mark.parametrize("strided", [False, True])
-def test_compiled_gradient_of_a_texture_in_any_layout(strided):
+@pytest.mark.parametrize(("strided", "apart"), [(False, True), (True, True), (True, False)])
+def test_compiled_gradient_of_a_texture_in_any_layout(monkeypatch, strided, apart):
+    """Also in the way of a GPU, whose kernels add it themselves."""
+    calls, scatter = [], taps.scatter
+    monkeypatch.setattr(taps, "scatter", lambda *given: calls.append(given) or scatter(*given))
+    if not apart:
+        monkeypatch.setattr(tap_kernels, "_APART", ())
     grads = []
     for engine in ("eager", "compiled"):
         inputs = make_inputs(dtype=torch.float32)
@@ -82,6 +88,7 @@ def test_compiled_gradient_of_a_texture_in_any_layout(strided):
         grads.append(leaf.grad)
     assert grads[0].any()
     assert torch.allclose(*grads, rtol=1e-4, atol=1e-5)
+    assert bool(calls) == apart
 
 
 class TestHalfStorage:

@@ -1,7 +1,8 @@
 """One tap of a sum, or some: forward, and backward by computing it again; eager or compiled.
 
 A compiled backward adds the gradient of a texture in place: what a tap reads has a probe added,
-whose gradient is that of what was read, and which goes where it was read.
+whose gradient is that of what was read, and which goes where it was read. On a GPU the kernel adds
+it; on a CPU its threads would need atomic additions, which cost ten times what `scatter` takes.
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ __all__ = [
     "Inputs",
     "Kernel",
     "Lookups",
+    "Moved",
     "Part",
     "Planes",
     "Reads",
@@ -30,6 +32,7 @@ __all__ = [
     "floating",
     "kernel_of",
     "reads_of",
+    "scatter",
 ]
 
 Engine = Literal["eager", "compiled"]
@@ -40,8 +43,13 @@ Added = tuple[Tensor | Planes, ...]
 TapFunction = Callable[[Tensor, Tensor, Inputs, Any], Added]
 """``tap(index, count, inputs, options)``: index and count are 0-d float tensors."""
 
+Moved = tuple[tuple[int, Tensor, Tensor], ...]
+"""Of each lookup in a texture: its first channel, where, (P * M,), gradient, (channels, P * M)."""
 Reads = tuple[tuple[tuple[int, int, int], ...], ...]
 """Of each texture, each lookup's first channel, number of channels, and parameter sets."""
+
+
+_APART = ("cpu",)  # devices on which gradients of textures are added outside of the kernel
 
 
 class Lookups:
@@ -146,7 +154,7 @@ class Part(NamedTuple):
     peaks: Planes
     """The accumulators that are maxima."""
     scattered: Inputs
-    """Gradients of textures, flat, which are added to in place."""
+    """Gradients of textures, (C, rows * W), which are added to in place."""
 
 
 @dataclass(frozen=True)
@@ -159,14 +167,15 @@ class Kernel:
         engine: How it runs. Only a compiled backward adds to `Part.scattered`.
         add: ``add(sums, indices, count, inputs)``: the sums with these taps added.
         pull: ``pull(totals, taken, indices, count, part, reads, color_from)``: gradients with those
-            of these taps added, and where each maximum has been given its gradient.
+            of these taps added, where each maximum has been given its gradient, and what each tap
+            leaves to `scatter`, texture by texture.
     """
 
     tap: TapFunction
     options: Hashable
     engine: Engine
     add: Callable[[Planes, Planes, Tensor, Inputs], Planes]
-    pull: Callable[..., tuple[Inputs, Planes]]
+    pull: Callable[..., tuple[Inputs, Planes, list[list[Moved]]]]
 
 
 @functools.lru_cache(maxsize=128)
@@ -195,15 +204,21 @@ def kernel_of(tap: TapFunction, options: Hashable, engine: Engine, num_summed: i
         part: Part,
         reads: Reads,
         color_from: int,
-    ) -> tuple[Inputs, Planes]:
+    ) -> tuple[Inputs, Planes, list[list[Moved]]]:
+        left: list[list[Moved]] = []
         for index in indices:
 
             def one_tap(inputs: dict[str, Any], index: Tensor = index) -> Planes:
                 return flat(tap(index, count, inputs, options))
 
-            parts, taken = _pull_one(one_tap, taken, part, reads, num_summed, color_from)
+            parts, taken, moved = _pull_one(one_tap, taken, part, reads, num_summed, color_from)
             totals = {name: totals[name] + parts[name] for name in totals}
-        return totals, taken
+            if part.grads[0].device.type in _APART:
+                left.append(moved)
+            else:
+                for name, lookups in zip(part.scattered, moved, strict=True):
+                    _scatter_in_kernel(part.scattered[name], part.others[name], lookups)
+        return totals, taken, left
 
     if engine == "compiled":
         add, pull = compile_alone(add, dynamic=True), compile_alone(pull, dynamic=True)
@@ -217,8 +232,8 @@ def _pull_one(
     reads: Reads,
     num_summed: int,
     color_from: int,
-) -> tuple[Inputs, Planes]:
-    """Return the gradients of one tap, and where each maximum has been given its gradient."""
+) -> tuple[Inputs, Planes, list[Moved]]:
+    """Return the gradients of one tap, where maxima have been given theirs, and of what it read."""
     grads = part.grads
 
     def probed(leaves: Inputs, probes: list[list[Tensor]]) -> tuple[Planes, list[list[Tensor]]]:
@@ -241,10 +256,14 @@ def _pull_one(
         first.append((value >= peak - 1e-6 * peak.abs()) & ~before)
     due = [g * f for g, f in zip(grads[num_summed:], first, strict=True)]
     parts, moved = vjp(grads[:num_summed] + tuple(due))
-    for name, each, where, given in zip(part.scattered, reads, places, moved, strict=True):
-        for (start, _, _), place, gradient in zip(each, where, given, strict=True):
-            _scatter(part.scattered[name], part.others[name], start, place, gradient)
-    return parts, tuple(t | f for t, f in zip(taken, first, strict=True))
+    lookups = [
+        tuple(
+            (start, place.flatten().long(), gradient.flatten(1))
+            for (start, _, _), place, gradient in zip(*texture, strict=True)
+        )
+        for texture in zip(reads, places, moved, strict=True)
+    ]
+    return parts, tuple(t | f for t, f in zip(taken, first, strict=True)), lookups
 
 
 def _lookups(
@@ -257,17 +276,22 @@ def _lookups(
     return Lookups(texture, probes, read, color_from if name == "texture" else 0)
 
 
-def _scatter(total: Tensor, texture: Tensor, first: int, place: Tensor, gradient: Tensor) -> None:
-    """Add the gradient of what was read to that of a texture, in place.
+def scatter(total: Tensor, moved: Moved) -> None:
+    """Add the gradients of what was read to that of a texture, in place.
 
     Args:
-        total: Gradient of the texture, flat.
-        texture: The texture, (C, rows, W).
-        first: Its first channel that was read.
-        place: Where, in a channel, (P, 1, 1, M).
-        gradient: Of what was read, (channels, P, 1, 1, M).
+        total: Gradient of the texture, (C, rows * W).
+        moved: What lookups leave.
     """
+    for start, place, gradient in moved:
+        channels = gradient.shape[0]
+        rows = total[start : start + channels]
+        rows.scatter_add_(1, place.expand(channels, -1), gradient.to(total.dtype))
+
+
+def _scatter_in_kernel(total: Tensor, texture: Tensor, moved: Moved) -> None:
     size = texture.shape[1] * texture.shape[2]
-    for channel in range(gradient.shape[0]):
-        index = place.flatten().long() + (first + channel) * size
-        total.index_put_((index,), gradient[channel].flatten(), accumulate=True)
+    for start, place, gradient in moved:
+        for channel in range(gradient.shape[0]):
+            index = (place + (start + channel) * size,)
+            total.view(-1).index_put_(index, gradient[channel], accumulate=True)

@@ -33,6 +33,7 @@ from torchblur.ops.tap_kernels import (
     floating,
     kernel_of,
     reads_of,
+    scatter,
 )
 
 __all__ = ["Engine", "Inputs", "Lists", "Planes", "TapFunction", "sum_taps"]
@@ -245,7 +246,7 @@ class _SumTaps(torch.autograd.Function):
         textures = [name for name in wanted if job.lists.num_pixels and named[name].ndim == 3]
         # Any pixel of a texture may be read by any part: its gradient is one sum over all of them.
         whole = bool(textures) and not in_place
-        scattered = {name: totals[name].view(-1) for name in textures if in_place}
+        scattered = {name: totals[name].flatten(1) for name in textures if in_place}
         for part in [None] if whole else job.parts(floating(named)):
             pieces = {name: job.part(tensor, part) for name, tensor in named.items()}
             rest = [job.part(tensor, part) for tensor in (*tensors[len(needed) :], *grads)]
@@ -269,7 +270,7 @@ def _pull(
         job: The sum.
         named: All inputs.
         wanted: Names of those whose gradient is wanted.
-        scattered: Gradients of textures, flat, which are added to in place and not returned.
+        scattered: Gradients of textures, (C, rows * W), added to in place and not returned.
         rest: The maxima, then the gradients of all accumulators.
     """
     num_maxima = len(job.form.shapes) - job.form.num_summed
@@ -288,9 +289,12 @@ def _pull(
     taken = tuple(torch.zeros_like(peak, dtype=torch.bool) for peak in peaks)
     groups, number = _groups(job.num_samples, floating(named))
     for indices in groups:
-        totals, taken = job.kernel.pull(
+        totals, taken, left = job.kernel.pull(
             totals, taken, indices, number, part, reads, job.lists.color_from
         )
+        for lookups in left:
+            for total, moved in zip(scattered.values(), lookups, strict=True):
+                scatter(total, moved)
     return totals
 
 
