@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 
-# The fits whose presets and cards are shipped. Rendering and fitting takes about an hour on two cores.
+# The fits whose presets and cards are shipped. Rendering and fitting takes about an hour.
 FITS := guertin2014 mcguire2012 sousa2013 jimenez2014 notes2025 tan2022 torchblur warp stream \
         pareto-guertin2014 pareto-notes2025
 
