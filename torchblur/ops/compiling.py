@@ -6,6 +6,7 @@ Compiled kernels are kept on disk, so that only the first process of all compile
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import importlib
 import itertools
@@ -141,6 +142,7 @@ def compile_alone(function: Callable[..., Any], **options: Any) -> Callable[...,
         **options: Of `torch.compile`.
     """
     load_compiler()
+    _look_at_processor()
     name = f"{function.__name__}_{next(_numbers)}"
     own = FunctionType(
         function.__code__.replace(co_name=name),
@@ -150,6 +152,21 @@ def compile_alone(function: Callable[..., Any], **options: Any) -> Callable[...,
         function.__closure__,
     )
     return torch.compile(own, **options)
+
+
+@functools.cache
+def _look_at_processor() -> None:
+    """Let torch find out which vectors the CPU has, beside all else that comes before a kernel.
+
+    It compiles and loads small programs for that, one by one: 9 s once, 1.5 s in each process.
+    """
+
+    def look() -> None:
+        with contextlib.suppress(Exception):  # torch does it again where it needs it, and tells
+            importlib.import_module("torch._inductor.cpu_vec_isa").valid_vec_isa_list()
+
+    if not torch.cuda.is_available():
+        threading.Thread(target=look, name="torchblur-processor", daemon=True).start()
 
 
 def _chosen_folder() -> str | None:
