@@ -67,6 +67,23 @@ def test_nothing_is_gathered_where_nothing_moves(monkeypatch, name):
     assert torch.equal(image, frame.color)
 
 
+@pytest.mark.parametrize("resolution", ["full", "half"])
+def test_layers_of_a_still_frame_are_those_of_the_long_way(resolution):
+    """The 2025 notes' filter does without all that comes after the tiles."""
+    frame = random_frame(48, 90, speed=0.1)
+    blur = get_filter("notes2025")(tile_size=10, resolution=resolution, early_out=0.5)
+    whole = blur.layers(frame)
+    assert whole["color"].requires_grad
+    assert whole["primary"].any()
+    with torch.no_grad():
+        short = blur.layers(frame)
+    assert not short["color"].requires_grad
+    assert whole.keys() == short.keys()
+    for name, plane in whole.items():
+        assert plane.shape == short[name].shape, name
+        assert torch.allclose(plane, short[name], atol=1e-6), name
+
+
 @pytest.mark.parametrize("batch_size", [1, 2])
 @pytest.mark.parametrize("name", FILTERS)
 def test_what_moves_alone_gives_what_all_pixels_give(monkeypatch, name, batch_size):

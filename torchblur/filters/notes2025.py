@@ -105,9 +105,12 @@ def _layers(frame: Frame, values: Values, engine: Engine) -> dict[str, Tensor]:
     first, second = (tile_lookup(t, frame.color, values.tile_size, offset) for t in tiles)
     linear = tile_lookup(least, frame.color, values.tile_size, offset) >= values.bilinear_min
     lines = _lines(first, second, linear, values)
+    active = PixelList.where(_over_sets(lines[0].used, frame))
+    if active.count == 0 and not torch.is_grad_enabled():
+        none = torch.zeros_like(first[:, :1])
+        return Blurred(frame.color, none, none, none, none)._asdict() | tiles._asdict()
     shared = shared_inputs(frame, spread, linear, values)
     shared |= revealed_inputs(frame, values, lambda f, v: _whole(f, v, engine))
-    active = PixelList.where(_over_sets(lines[0].used, frame))
     sums = [gather_line(shared, line, values, engine, active) for line in lines]
     image = compose(frame, sums, lines[0].used, values)
     if values.resolution == "half" and values.alpha_fade:

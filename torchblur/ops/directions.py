@@ -40,8 +40,15 @@ def secondary_score(primary: Tensor, sample: Tensor, exponent: float | Tensor = 
     Reference: 2025 notes, Second Blur Direction. We differ: the text does not say what its weight
         of the angle multiplies; we take the length. The exponent is a parameter (2 there).
     """
-    cosine = (direction(primary) * direction(sample)).sum(1, keepdim=True).abs()
-    return length(sample) * (1 - cosine).clamp_min(0) ** exponent
+    return _score(direction(primary), direction(sample), length(sample), exponent)
+
+
+def _score(primary: Tensor, unit: Tensor, size: Tensor, exponent: float | Tensor) -> Tensor:
+    """Return `secondary_score` from the unit vectors of both and the candidate's length."""
+    (ax, ay), (bx, by) = primary.split(1, 1), unit.split(1, 1)
+    cosine = (ax * bx + ay * by).abs()  # a sum over two channels would cost more
+    score: Tensor = size * (1 - cosine).clamp_min(0) ** exponent
+    return score
 
 
 def tile_directions(
@@ -97,7 +104,7 @@ def _best_in_windows(
     scores, vectors = [], []
     for candidate in candidates:
         whole = _padded(candidate, window)
-        score, index = _window_scores(whole, primary, window, exponent)
+        score, index = _window_scores(_Candidates.of(whole), primary, window, exponent)
         scores.append(score)
         vectors.append(_picked(whole, index))
     best = torch.stack(scores).argmax(0)
@@ -109,12 +116,13 @@ def _best_of_pixels(
 ) -> Tensor:
     """Return the pixel's vector in the 3x3 tiles with the highest score against their primary."""
     whole = _padded(velocity, size)
+    candidates = _Candidates.of(whole)
     scores, vectors = [], []
     for offset in _OFFSETS:
         x, y = offset
         # The neighbor at +offset is judged against this tile's primary, and the result moved back.
         score, index = _window_scores(
-            whole, _moved(primary, x, y, 0.0), size, exponent, offset if cull else None
+            candidates, _moved(primary, x, y, 0.0), size, exponent, offset if cull else None
         )
         scores.append(_moved(score, -x, -y, -1.0))
         vectors.append(_moved(_picked(whole, index), -x, -y, 0.0))
@@ -138,19 +146,32 @@ def _best_of_neighbors(
     return _chosen(vectors, torch.stack(scores).argmax(0))
 
 
+class _Candidates(NamedTuple):
+    """Vectors among which windows choose, (B, 2, H, W), without a gradient."""
+
+    vector: Tensor
+    unit: Tensor
+    size: Tensor
+
+    @classmethod
+    def of(cls, vector: Tensor) -> _Candidates:
+        vector = vector.detach()
+        return cls(vector, direction(vector), length(vector))
+
+
 @torch.no_grad()
 def _window_scores(
-    whole: Tensor,
+    candidates: _Candidates,
     primary: Tensor,
     window: int,
     exponent: float | Tensor,
     offset: tuple[int, int] | None = None,
 ) -> tuple[Tensor, Tensor]:
     """Return the highest score per window, (B, 1, Ty, Tx), and the place of the vector."""
-    spread = primary.repeat_interleave(window, 2).repeat_interleave(window, 3)
-    score = secondary_score(spread, whole, exponent)
+    unit = direction(primary).repeat_interleave(window, 2).repeat_interleave(window, 3)
+    score = _score(unit, candidates.unit, candidates.size, exponent)
     if offset is not None:
-        score = torch.where(_reaches(whole, *offset), score, -1.0)
+        score = torch.where(_reaches(candidates.vector, *offset), score, -1.0)
     return F.max_pool2d(score, window, return_indices=True)
 
 
