@@ -11,8 +11,8 @@ from torchblur.testing.frames import random_frame
 FILTERS = ("guertin2014", "jimenez2014", "line", "mcguire2012", "notes2025", "sousa2013", "tan2022")
 
 
-def partly_moving(batch_size=1, seed=0):
-    frame = random_frame(48, 220, batch_size=batch_size, speed=60.0, seed=seed)
+def partly_moving(batch_size=1, seed=0, dtype=torch.float32):
+    frame = random_frame(48, 220, batch_size=batch_size, speed=60.0, seed=seed, dtype=dtype)
     velocity = frame.velocity.clone()
     velocity[:, :, :12] = 0
     velocity[..., 30:] = 0
@@ -87,13 +87,13 @@ def test_layers_of_a_still_frame_are_those_of_the_long_way(resolution):
 @pytest.mark.parametrize("batch_size", [1, 2])
 @pytest.mark.parametrize("name", FILTERS)
 def test_what_moves_alone_gives_what_all_pixels_give(monkeypatch, name, batch_size):
-    frame = partly_moving(batch_size)
+    frame = partly_moving(batch_size, dtype=torch.float64)
     results = []
     for dense in (False, True):
         if dense:
             monkeypatch.setattr("torchblur.ops.pixels._DENSE", -1.0)
             monkeypatch.setattr("torchblur.filters.moving._ALMOST_ALL", -1.0)
-        blur = without_notices(make(name))
+        blur = without_notices(make(name).double())
         leaf = frame.color.clone().requires_grad_()
         given = dataclasses.replace(frame, color=leaf)
         image = blur(given)
@@ -102,7 +102,7 @@ def test_what_moves_alone_gives_what_all_pixels_give(monkeypatch, name, batch_si
         assert grads
         results.append([image.detach(), leaf.grad, *grads])
     for sparse, dense in zip(*results, strict=True):
-        assert torch.allclose(sparse, dense, rtol=1e-5, atol=1e-6)
+        assert torch.allclose(sparse, dense, rtol=1e-9, atol=1e-9)
 
 
 @pytest.mark.parametrize("lookup", ["nearest", "bilinear"])

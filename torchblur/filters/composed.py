@@ -11,10 +11,10 @@ from torch import Tensor
 from torchblur.filters.base import BlurFilter, Values
 from torchblur.filters.composed_config import ComposedConfig
 from torchblur.filters.composed_gather import alternate_tap, pair_tap, shared_inputs, tap_options
-from torchblur.filters.composed_motion import clean_edges, half_spreads, moving_pixels, tile_planes
+from torchblur.filters.composed_motion import clean_edges, half_spreads
 from torchblur.filters.composed_times import fill_hidden, time_tap
 from torchblur.filters.guertin2014 import center_direction
-from torchblur.filters.moving import packed_values
+from torchblur.filters.moving import moving_pixels, packed_values, tile_planes
 from torchblur.filters.notes2025_gather import Blurred, Line, Sums, compose
 from torchblur.filters.notes2025_postfilter import post_filter
 from torchblur.filters.places import SHORTEST_REACH, num_pairs
@@ -127,22 +127,13 @@ def _layers(frame: Frame, values: Values, engine: Engine) -> dict[str, Tensor]:
     ways = _ways(first, second, spread, local)
     lines = _lines(ways, inputs["linear"] > 0, moving, local)
     sums = _gather(ways, lines, inputs, pixels, local, engine)
-    image = _unpacked(_resolve(here, sums, spread, moving, local), frame, pixels)
+    image = _resolve(here, sums, spread, moving, local).images(frame, pixels)
     if values.post_filter:
-        wide = [
-            line._replace(vector=pixels.unpack(line.vector), used=pixels.unpack(line.used))
-            for line in lines.values()
-        ]
+        wide = [line.image(pixels) for line in lines.values()]
         image = post_filter(frame, image, wide, values, engine)
     layers = image._asdict() | tiles._asdict()
     del layers["influence"]
     return layers
-
-
-def _unpacked(image: Blurred, frame: Frame, pixels: PixelList) -> Blurred:
-    """Return images of the lists: all other pixels have their own color, and 0."""
-    color, *planes = image
-    return Blurred(pixels.unpack(color, over=frame.color), *(pixels.unpack(p) for p in planes))
 
 
 # -- taps ------------------------------------------------------------------------------------------

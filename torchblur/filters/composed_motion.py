@@ -7,17 +7,12 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from torchblur.filters.base import Values
-from torchblur.filters.moving import moving_tiles
-from torchblur.filters.places import tile_noise
 from torchblur.filters.spreads import Spread, exact_spread, longest_spread, tile_motions
 from torchblur.frame import Frame
 from torchblur.ops.directions import TileDirections
-from torchblur.ops.noise import noise_plane
-from torchblur.ops.pixels import PixelList
-from torchblur.ops.tiles import neighbor_min, tile_lookup, tile_min, tile_offset
 from torchblur.ops.velocity import clamp_length, half_velocity, quantize_uint8
 
-__all__ = ["clean_edges", "half_spreads", "moving_pixels", "tile_planes"]
+__all__ = ["clean_edges", "half_spreads"]
 
 _LEVEL = 1e-6  # neighbors whose depths differ by less, as a share, are one surface
 
@@ -65,30 +60,3 @@ def half_spreads(frame: Frame, values: Values) -> tuple[Spread, TileDirections]:
     if values.velocity_encoding == "tiles":
         tiles = TileDirections(*(quantize_uint8(tile, size) for tile in tiles))
     return exact_spread(half), tiles
-
-
-def moving_pixels(frame: Frame, tiles: TileDirections, values: Values) -> PixelList:
-    """Return the pixels whose tiles move, or may look up one that does."""
-    wanted = moving_tiles(frame, values, tiles.primary)
-    if values.noise != "none" and bool((values.tile_jitter > 0).any()):
-        wanted = F.max_pool2d(wanted, 3, stride=1, padding=1)
-    return PixelList.in_tiles(wanted > 0, frame.color, values.tile_size)
-
-
-def tile_planes(
-    color: Tensor, size: Tensor, tiles: TileDirections, pixels: PixelList, values: Values
-) -> list[Tensor]:
-    """Return both motions of the pixels' tiles, and the shortest half spread of the 3x3 tiles.
-
-    Args:
-        color: For its size, (B, 3, H, W).
-        size: Half spread of all pixels, px, (B, 1, H, W).
-        tiles: The motions.
-        pixels: Whose.
-        values: The parameters.
-    """
-    edge = values.tile_size
-    noise = noise_plane(tile_noise(values), color, 1, values.seed, pixels)
-    offset = tile_offset(color, noise, edge, pixels.pack(values.tile_jitter), pixels)
-    least = neighbor_min(tile_min(size.detach(), edge))
-    return [tile_lookup(t, color, edge, offset, pixels=pixels) for t in (*tiles, least)]

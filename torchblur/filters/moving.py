@@ -11,24 +11,29 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from torchblur.filters.base import Values
+from torchblur.filters.places import tile_noise
 from torchblur.filters.reconstruction import TEXTURE_COLOR, texture_of
 from torchblur.filters.revealed import revealed_inputs
 from torchblur.filters.spreads import Spread, pixel_spread
 from torchblur.frame import Frame
+from torchblur.ops.directions import TileDirections
 from torchblur.ops.gather import Inputs
 from torchblur.ops.noise import NoiseKind, noise_plane
 from torchblur.ops.pixels import PixelList, select, takes_all_pixels
-from torchblur.ops.tiles import tile_lookup, tile_offset
+from torchblur.ops.tiles import neighbor_min, tile_lookup, tile_min, tile_offset
 from torchblur.ops.velocity import length
 
 __all__ = [
     "Filtered",
     "Moving",
     "Stray",
+    "moving_among",
     "moving_part",
+    "moving_pixels",
     "moving_tiles",
     "packed_values",
     "revealed_part",
+    "tile_planes",
 ]
 
 _ALMOST_ALL = 0.95  # from here on a choice costs more than it saves
@@ -152,7 +157,7 @@ def moving_part(
         amplitude = pixels.pack(stray.amplitude)
         shift = tile_offset(color, noise, values.tile_size, amplitude, pixels)
     dominant = tile_lookup(neighborhood, color, values.tile_size, shift, pixels=pixels)
-    chosen = _moving_pixels(dominant, pixels.pack(values.early_out))
+    chosen = moving_among(dominant, pixels.pack(values.early_out))
     if chosen is not None:
         pixels, dominant = pixels.some(chosen), select(dominant, chosen)
         shift = None if shift is None else select(shift, chosen)
@@ -190,7 +195,7 @@ def moving_tiles(frame: Frame, values: Values, neighborhood: Tensor) -> Tensor:
     return moving
 
 
-def _moving_pixels(dominant: Tensor, least: Tensor) -> Tensor | None:
+def moving_among(dominant: Tensor, least: Tensor) -> Tensor | None:
     """Return which pixels of a list move, for any set; None: so many that all may be taken."""
     if takes_all_pixels():
         return None
@@ -199,6 +204,35 @@ def _moving_pixels(dominant: Tensor, least: Tensor) -> Tensor | None:
     if count > _ALMOST_ALL * moving.shape[0] or (count == 0 and torch.is_grad_enabled()):
         return None
     return moving.nonzero()[:, 0]
+
+
+def moving_pixels(frame: Frame, tiles: TileDirections, values: Values) -> PixelList:
+    """Return the pixels whose tiles move, or may look up one that does."""
+    if takes_all_pixels():
+        return PixelList.all(frame.color)
+    wanted = moving_tiles(frame, values, tiles.primary)
+    if values.noise != "none" and bool((values.tile_jitter > 0).any()):
+        wanted = _dilated(wanted, 1)
+    return PixelList.in_tiles(wanted > 0, frame.color, values.tile_size)
+
+
+def tile_planes(
+    color: Tensor, size: Tensor, tiles: TileDirections, pixels: PixelList, values: Values
+) -> list[Tensor]:
+    """Return both motions of the pixels' tiles, and the shortest half spread of the 3x3 tiles.
+
+    Args:
+        color: For its size, (B, 3, H, W).
+        size: Half spread of all pixels, px, (B, 1, H, W).
+        tiles: The motions.
+        pixels: Whose.
+        values: The parameters.
+    """
+    edge = values.tile_size
+    noise = noise_plane(tile_noise(values), color, 1, values.seed, pixels)
+    offset = tile_offset(color, noise, edge, pixels.pack(values.tile_jitter), pixels)
+    least = neighbor_min(tile_min(size.detach(), edge))
+    return [tile_lookup(t, color, edge, offset, pixels=pixels) for t in (*tiles, least)]
 
 
 def revealed_part(

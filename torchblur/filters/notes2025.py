@@ -10,6 +10,7 @@ from torch import Tensor
 
 from torchblur.configured import batch_size_of
 from torchblur.filters.base import BlurFilter, Values
+from torchblur.filters.moving import moving_among, moving_pixels, packed_values, tile_planes
 from torchblur.filters.notes2025_config import Notes2025Config
 from torchblur.filters.notes2025_gather import (
     SHARED_PARAMETERS,
@@ -20,17 +21,14 @@ from torchblur.filters.notes2025_gather import (
     shared_inputs,
 )
 from torchblur.filters.notes2025_postfilter import post_filter
-from torchblur.filters.places import num_pairs, tile_noise
+from torchblur.filters.places import num_pairs
 from torchblur.filters.revealed import layer_behind, revealed_inputs
 from torchblur.filters.spreads import Spread, exact_spread, longest_spread, tile_motions
 from torchblur.frame import Frame
 from torchblur.ops.directions import TileDirections
 from torchblur.ops.gather import Engine
-from torchblur.ops.noise import noise_plane
-from torchblur.ops.pixels import PixelList
+from torchblur.ops.pixels import PixelList, select
 from torchblur.ops.resample import HalfImage, UpsampleRules, box_halve, depth_halve, upsample_over
-from torchblur.ops.tiles import neighbor_min, tile_lookup, tile_min
-from torchblur.ops.tiles import tile_offset as offset_of_tiles
 from torchblur.ops.velocity import clamp_length, direction, half_velocity, length, quantize_uint8
 from torchblur.params import declared
 
@@ -100,29 +98,39 @@ class Notes2025Blur(BlurFilter):
 
 
 def _layers(frame: Frame, values: Values, engine: Engine) -> dict[str, Tensor]:
-    spread, tiles, least = _motion(frame, values)
-    offset = _tile_shift(frame.color, values)
-    first, second = (tile_lookup(t, frame.color, values.tile_size, offset) for t in tiles)
-    linear = tile_lookup(least, frame.color, values.tile_size, offset) >= values.bilinear_min
-    lines = _lines(first, second, linear, values)
-    active = PixelList.where(_over_sets(lines[0].used, frame))
-    if active.count == 0 and not torch.is_grad_enabled():
-        none = torch.zeros_like(first[:, :1])
+    spread, tiles = _motion(frame, values)
+    pixels, planes = _moving(frame, spread, tiles, values)
+    if pixels.count == 0:
+        none = torch.zeros_like(frame.color[:, :1])
         return Blurred(frame.color, none, none, none, none)._asdict() | tiles._asdict()
-    shared = shared_inputs(frame, spread, linear, values)
-    shared |= revealed_inputs(frame, values, lambda f, v: _whole(f, v, engine))
-    sums = [gather_line(shared, line, values, engine, active) for line in lines]
-    image = compose(frame, sums, lines[0].used, values)
+    here, local = frame.only("depth", "valid").map(pixels.pack), packed_values(values, pixels)
+    first, second, least = planes
+    linear = least >= local.bilinear_min
+    lines = _lines(first, second, linear, local)
+    shared = shared_inputs(frame, spread, linear, pixels, local)
+    shared |= pixels.lists(revealed_inputs(frame, values, lambda f, v: _whole(f, v, engine)))
+    sums = [gather_line(shared, line, local, engine, pixels) for line in lines]
+    blurred = compose(here, sums, lines[0].used, local)
     if values.resolution == "half" and values.alpha_fade:
-        image = _faded(image, values)
+        blurred = _faded(blurred, local)
+    image = blurred.images(frame, pixels)
     if values.post_filter:
-        image = post_filter(frame, image, lines, values, engine)
+        image = post_filter(frame, image, [line.image(pixels) for line in lines], values, engine)
     return image._asdict() | tiles._asdict()
 
 
-def _over_sets(mask: Tensor, frame: Frame) -> Tensor:
-    """Return where any set of parameters that shares the frame has a pixel, (B, 1, H, W)."""
-    return mask.any(0, keepdim=True) if frame.batch_size == 1 else mask
+def _moving(
+    frame: Frame, spread: Spread, tiles: TileDirections, values: Values
+) -> tuple[PixelList, list[Tensor]]:
+    """Return the pixels whose tile moves, and their `tile_planes`."""
+    pixels = moving_pixels(frame, tiles, values)
+    if pixels.count == 0:
+        return pixels, []
+    planes = tile_planes(frame.color, spread.length, tiles, pixels, values)
+    chosen = moving_among(planes[0], pixels.pack(values.early_out))
+    if chosen is None:
+        return pixels, planes
+    return pixels.some(chosen), [select(plane, chosen) for plane in planes]
 
 
 def _with(values: Values, **changed: object) -> Values:
@@ -134,8 +142,8 @@ def _whole(frame: Frame, values: Values, engine: Engine) -> Tensor:
     return _layers(frame, _with(values, resolution="full", post_filter=False), engine)["color"]
 
 
-def _motion(frame: Frame, values: Values) -> tuple[Spread, TileDirections, Tensor]:
-    """Return half spreads per pixel, both directions per tile, and the least of the 3x3 tiles.
+def _motion(frame: Frame, values: Values) -> tuple[Spread, TileDirections]:
+    """Return half spreads per pixel, and both directions per tile.
 
     Tiles choose by the length before it is clamped: clamped vectors are all equally long, and
     rounding would choose among them.
@@ -148,13 +156,7 @@ def _motion(frame: Frame, values: Values) -> tuple[Spread, TileDirections, Tenso
         whole = half = quantize_uint8(half, size)
     tiles = tile_motions(whole, values, two=values.directions == "two")
     tiles = TileDirections(*(clamp_length(tile, longest) for tile in tiles))
-    spread = exact_spread(half)
-    return spread, tiles, neighbor_min(tile_min(spread.length.detach(), size))
-
-
-def _tile_shift(color: Tensor, values: Values) -> Tensor:
-    noise = noise_plane(tile_noise(values), color, 1, values.seed)
-    return offset_of_tiles(color, noise, values.tile_size, values.tile_jitter)
+    return exact_spread(half), tiles
 
 
 def _lines(first: Tensor, second: Tensor, linear: Tensor, values: Values) -> list[Line]:

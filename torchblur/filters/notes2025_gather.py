@@ -12,7 +12,7 @@ from torchblur.filters.places import SHORTEST_REACH, num_pairs, tap_shift
 from torchblur.filters.reconstruction import ColorLookup, Tap, sample, texture_of
 from torchblur.filters.spreads import Spread
 from torchblur.frame import Frame, Shutter
-from torchblur.ops.gather import Engine, Inputs, Planes, gather, pixel_grid, weighted
+from torchblur.ops.gather import Engine, Inputs, Planes, gather_lists, weighted
 from torchblur.ops.pixels import PixelList
 from torchblur.ops.spread import Mirror, SpreadForm, TapPair, depth_shares, mirror, spread_weight
 from torchblur.ops.velocity import direction, length
@@ -46,7 +46,7 @@ _PARAMETERS = ("depth_level", "spread_offset", "spread_slope", "direction_expone
 
 
 class Line(NamedTuple):
-    """One direction that is sampled, per pixel."""
+    """One direction that is sampled, per pixel: images or lists."""
 
     vector: Tensor
     """Half spread of the tile in px, (B, 2, H, W)."""
@@ -56,6 +56,10 @@ class Line(NamedTuple):
     """Pairs of taps, (B, 1, H, W)."""
     most_pairs: int
     """The most that any pixel has."""
+
+    def image(self, pixels: PixelList) -> Line:
+        """Return images of the lists, 0 elsewhere; the pairs stay as they are."""
+        return self._replace(vector=pixels.unpack(self.vector), used=pixels.unpack(self.used))
 
 
 class Sums(NamedTuple):
@@ -72,7 +76,7 @@ class Sums(NamedTuple):
 
 
 class Blurred(NamedTuple):
-    """What the main pass leaves."""
+    """What the main pass leaves: images or lists."""
 
     color: Tensor
     alpha: Tensor
@@ -82,6 +86,11 @@ class Blurred(NamedTuple):
     weight: Tensor
     """Mean weight of the taps, in [0, 1], (B, 1, H, W)."""
     influence: Tensor
+
+    def images(self, frame: Frame, pixels: PixelList) -> Blurred:
+        """Return images of the lists: all other pixels have their own color, and 0."""
+        color, *planes = self
+        return Blurred(pixels.unpack(color, over=frame.color), *(pixels.unpack(p) for p in planes))
 
 
 class _Options(NamedTuple):
@@ -95,26 +104,29 @@ class _Options(NamedTuple):
     color_lookup: ColorLookup
 
 
-def shared_inputs(frame: Frame, spread: Spread, linear: Tensor, values: Values) -> Inputs:
-    """Return the planes that the taps of all lines look at.
+def shared_inputs(
+    frame: Frame, spread: Spread, linear: Tensor, pixels: PixelList, values: Values
+) -> Inputs:
+    """Return what the taps of all lines look at, as lists.
 
     Args:
         frame: The frame.
         spread: Its half spreads.
-        linear: Where the color may be looked up bilinearly, bool, (B, 1, H, W).
-        values: The parameters.
+        linear: Where the color may be looked up bilinearly, a list.
+        pixels: The pixels.
+        values: The parameters; what is given per pixel is a list.
     """
-    x, y = pixel_grid(frame.color)
+    x, y = pixels.grid(frame.color)
     relative = values.depth_compare == "relative"
     inputs = {
         "texture": texture_of(frame, spread),
         "x": x,
         "y": y,
-        "shift": tap_shift(frame.color, values),
-        "depth": frame.finite_depth(),
-        "half": spread.half,
-        "unit": spread.unit,
-        "length": spread.length,
+        "shift": tap_shift(frame.color, values, pixels),
+        "depth": pixels.pack(frame.finite_depth()),
+        "half": pixels.pack(spread.half),
+        "unit": pixels.pack(spread.unit),
+        "length": pixels.pack(spread.length),
         "linear": linear.to(frame.dtype),
         "depth_scale": 1 / (values.relative_depth_range if relative else values.depth_range),
     }
@@ -122,16 +134,16 @@ def shared_inputs(frame: Frame, spread: Spread, linear: Tensor, values: Values) 
 
 
 def gather_line(
-    shared: Inputs, line: Line, values: Values, engine: Engine, active: PixelList
+    shared: Inputs, line: Line, values: Values, engine: Engine, pixels: PixelList
 ) -> Sums:
-    """Sample along one line and return the means; zero where the line is not used.
+    """Sample along one line and return the means, lists; zero where the line is not used.
 
     Args:
         shared: From `shared_inputs`.
         line: Where to sample.
-        values: The parameters.
+        values: The parameters, as in `shared_inputs`.
         engine: Of the gather.
-        active: The pixels where anything moves.
+        pixels: The pixels.
     """
     reach = length(line.vector).clamp_min(SHORTEST_REACH)
     unit = direction(line.vector)
@@ -152,8 +164,8 @@ def gather_line(
         values.softness,
         values.color_lookup,
     )
-    *totals, influence = gather(
-        _pair, options, line.most_pairs, inputs, engine, num_maxima=1, active=active
+    *totals, influence = gather_lists(
+        _pair, options, line.most_pairs, inputs, pixels, engine, num_maxima=1
     )
     *sums, alpha = (total / (2 * line.pairs) for total in totals)
     if values.accurate_alpha:
@@ -245,7 +257,7 @@ def compose(frame: Frame, lines: list[Sums], moving: Tensor, values: Values) -> 
     """Return the color of the main pass from the sums along one or two lines.
 
     Args:
-        frame: The frame, for its color.
+        frame: The frame, for its color; all may be lists.
         lines: Sums along the first and, if there is one, the second direction.
         moving: Where the tile moves; elsewhere the color stays, bool, (B, 1, H, W).
         values: The parameters.
