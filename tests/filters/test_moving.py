@@ -105,6 +105,21 @@ def test_what_moves_alone_gives_what_all_pixels_give(monkeypatch, name, batch_si
         assert torch.allclose(sparse, dense, rtol=1e-9, atol=1e-9)
 
 
+@pytest.mark.parametrize("name", ["guertin2014", "jimenez2014", "notes2025", "torchblur"])
+def test_pixels_that_stray_to_a_moving_tile_are_blurred(monkeypatch, name):
+    frame = partly_moving(dtype=torch.float64)
+    stray = {"tau": 2.0} if name == "guertin2014" else {"tile_jitter": 2.0}
+    straying = make(name, noise="gradient", **stray).double()
+    with torch.no_grad():
+        sparse = straying(frame)
+        monkeypatch.setattr("torchblur.ops.pixels._DENSE", -1.0)
+        monkeypatch.setattr("torchblur.filters.moving._ALMOST_ALL", -1.0)
+        dense = straying(frame)
+        straight = make(name, noise="gradient", **dict.fromkeys(stray, 0.0)).double()(frame)
+    assert torch.allclose(sparse, dense, rtol=0, atol=1e-9)
+    assert not torch.allclose(dense, straight, atol=1e-3)
+
+
 @pytest.mark.parametrize("lookup", ["nearest", "bilinear"])
 @pytest.mark.parametrize("batch_size", [1, 2])
 @pytest.mark.parametrize("name", ["guertin2014", "jimenez2014", "mcguire2012"])

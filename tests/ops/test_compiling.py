@@ -122,6 +122,25 @@ class TestWithoutACompiler:
             assert not compiling.compiler_works()
 
 
+def test_a_look_at_the_processor_that_fails_says_nothing(monkeypatch):
+    """It only saves time: torch looks again where it needs to know, and tells what is wrong."""
+    told, looks = [], []
+
+    def fail(name):
+        looks.append(name)
+        raise RuntimeError("torch has moved it")
+
+    monkeypatch.setattr(threading, "excepthook", told.append)
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    monkeypatch.setattr(compiling.importlib, "import_module", fail)
+    compiling._look_at_processor.__wrapped__()
+    for thread in threading.enumerate():
+        if thread.name == "torchblur-processor":
+            thread.join()
+    assert len(looks) == 1
+    assert not told
+
+
 @torch._dynamo.config.patch(recompile_limit=2)
 def test_functions_of_one_line_are_counted_apart():
     """Torch compiles no code object more often than this limit."""

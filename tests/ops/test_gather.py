@@ -27,6 +27,14 @@ def tap(index, count, inputs, options):
     return weighted(weight, read(inputs, x, y, options)), weight + 0 * x
 
 
+def split_tap(index, count, inputs, options):
+    """Read the channels of the texture in two places."""
+    x, y = inputs["x"] + index * inputs["step"], inputs["y"] + 0.3 * index
+    first = read(inputs, x, y, options, slice(0, 1))
+    rest = read(inputs, x + 1, y, options, slice(1, 3))
+    return weighted(index + inputs["decay"], (*first, *rest)), inputs["decay"] + 0 * x
+
+
 def make_inputs(batch_size=1, sets=1, dtype=torch.float64):
     generator = torch.Generator().manual_seed(3)
     image = torch.rand(batch_size, 3, 5, 9, dtype=dtype, generator=generator)
@@ -83,7 +91,7 @@ def test_compiled_gradient_of_a_texture_in_any_layout(monkeypatch, strided, apar
         inputs = make_inputs(dtype=torch.float32)
         leaf = inputs["texture"].clone().requires_grad_()
         given = leaf.transpose(2, 3).contiguous().transpose(2, 3) if strided else leaf
-        color, _ = gather(tap, "nearest", 3, inputs | {"texture": given}, engine)
+        color, _ = gather(split_tap, "nearest", 3, inputs | {"texture": given}, engine)
         color.square().sum().backward()
         grads.append(leaf.grad)
     assert grads[0].any()

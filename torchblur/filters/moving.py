@@ -27,6 +27,7 @@ __all__ = [
     "Filtered",
     "Moving",
     "Stray",
+    "Window",
     "moving_among",
     "moving_part",
     "moving_pixels",
