@@ -140,12 +140,12 @@ def _tap_inputs(part: Moving, variance: Tensor | None) -> Inputs:
         "texture": part.texture,
         "x": x,
         "y": y,
-        "w_n": w_n,
-        "w_c": w_c,
+        **_components("w_n", w_n),
+        **_components("w_c", w_c),
         "reach": length(part.dominant),
         "jitter": (2 * noise - 1) * values.eta * values.phi / values.num_samples,
         "depth": frame.finite_depth(),
-        "half": spread.half,
+        **_components("half", spread.half),
         "length": spread.length,
         "length_p": length_p,
         # A for a tap along w_n and along w_c, which is one plane for all taps
@@ -164,6 +164,12 @@ def _tap_inputs(part: Moving, variance: Tensor | None) -> Inputs:
     for key in (*WEIGHT_PARAMETERS, "direction_exponent"):
         inputs[key] = getattr(values, key)
     return inputs
+
+
+def _components(name: str, plane: Tensor) -> Inputs:
+    """Return x and y apart: a tap that takes two channels apart makes a loop of its own of that."""
+    x, y = plane.split(1, 1)
+    return {f"{name}_x": x, f"{name}_y": y}
 
 
 def _options(values: Values) -> _Options:
@@ -211,17 +217,17 @@ def _luma(frame: Frame, moving: Tensor, kind: str, color: Tensor) -> Tensor:
 
 def _tap(index: Tensor, count: Tensor, inputs: Inputs, options: _Options) -> tuple[Planes, Tensor]:
     t = (2 * (index + 1 + inputs["jitter"]) / (count + 1) - 1).clamp(-1, 1)
-    d, reach, own = inputs["w_n"], inputs["reach"], inputs["own_n"]
+    dx, dy, reach, own = (inputs[key] for key in ("w_n_x", "w_n_y", "reach", "own_n"))
     if options.two_directions:
         along_center = _takes_center_direction(index, inputs, options)
-        d = torch.where(along_center, inputs["w_c"], d)
+        dx = torch.where(along_center, inputs["w_c_x"], dx)
+        dy = torch.where(along_center, inputs["w_c_y"], dy)
         own = torch.where(along_center, inputs["own_c"], own)
         if options.own_length:
             reach = torch.where(along_center, inputs["length"], reach)
     along = (t + options.center) * reach
-    dx, dy = d.split(1, 1)
     tap = sample(inputs, inputs["x"] - along * dx, inputs["y"] - along * dy, options.color_lookup)
-    weight = _weight(along, d, tap, own, inputs, options)
+    weight = _weight(along, (dx, dy), tap, own, inputs, options)
     return weighted(weight, tap.color), weight if tap.valid is None else weight * tap.valid
 
 
@@ -233,7 +239,7 @@ def _takes_center_direction(index: Tensor, inputs: Inputs, options: _Options) ->
 
 
 def _weight(
-    along: Tensor, d: Tensor, tap: Tap, own: Tensor, inputs: Inputs, options: _Options
+    along: Tensor, d: Planes, tap: Tap, own: Tensor, inputs: Inputs, options: _Options
 ) -> Tensor:
     """Return the sum of the three weights of a tap."""
     front, behind = depth_weights(
@@ -244,12 +250,12 @@ def _weight(
         level=inputs["depth_level"],
         softness=options.softness,
     )
-    dx, dy = d.split(1, 1)
+    dx, dy = d
     length_s, length_p = torch.maximum(tap.length, inputs["min_length"]), inputs["length_p"]
     toward = tap.unit_x * dx + tap.unit_y * dy
     distance_s = distance_p = distance = along.abs()
     if options.center:
-        moved_p = (inputs["half"] * d).sum(1, keepdim=True)
+        moved_p = inputs["half_x"] * dx + inputs["half_y"] * dy
         distance_s = (along - options.center * tap.length * toward).abs()
         distance_p = (along - options.center * moved_p).abs()
         distance = torch.where(length_s <= length_p, distance_s, distance_p)

@@ -43,8 +43,8 @@ Added = tuple[Tensor | Planes, ...]
 TapFunction = Callable[[Tensor, Tensor, Inputs, Any], Added]
 """``tap(index, count, inputs, options)``: index and count are 0-d float tensors."""
 
-Moved = tuple[tuple[int, Tensor, Tensor], ...]
-"""Of each lookup in a texture: its first channel, where, (P * M,), gradient, (channels, P * M)."""
+Moved = tuple[tuple[int, Tensor, Planes], ...]
+"""Of each lookup in a texture: its first channel, where, (P * M,), and each channel's gradient."""
 Reads = tuple[tuple[tuple[int, int, int], ...], ...]
 """Of each texture, each lookup's first channel, number of channels, and parameter sets."""
 
@@ -59,7 +59,7 @@ class Lookups:
 
     Args:
         texture: Images, (C, rows, W).
-        probes: One for each lookup, in their order, (channels, P, 1, 1, M); None: none is added.
+        probes: Planes (P, 1, 1, M) for each lookup, in their order; None: none are added.
         read: Where each lookup's first channel, number of channels and place are noted.
         least: The first channel whose gradient is wanted; that of the ones before it is not.
         first: The texture's own first channel.
@@ -68,7 +68,7 @@ class Lookups:
     def __init__(
         self,
         texture: Tensor,
-        probes: Sequence[Tensor] | None,
+        probes: Sequence[Planes] | None,
         read: list[tuple[int, int, Tensor]],
         least: int,
         first: int = 0,
@@ -95,7 +95,7 @@ class Lookups:
         if self.probes is None:
             return planes
         probe = self.probes[len(self.read) - 1]
-        added = tuple(plane + probe[i] for i, plane in enumerate(planes[without:]))
+        added = tuple(p + zero for p, zero in zip(planes[without:], probe, strict=True))
         return planes[:without] + added
 
 
@@ -236,7 +236,7 @@ def _pull_one(
     """Return the gradients of one tap, where maxima have been given theirs, and of what it read."""
     grads = part.grads
 
-    def probed(leaves: Inputs, probes: list[list[Tensor]]) -> tuple[Planes, list[list[Tensor]]]:
+    def probed(leaves: Inputs, probes: list[list[Planes]]) -> tuple[Planes, list[list[Tensor]]]:
         notes: list[list[tuple[int, int, Tensor]]] = [[] for _ in probes]
         inputs: dict[str, Any] = part.others | leaves
         for name, probe, read in zip(part.scattered, probes, notes, strict=True):
@@ -245,8 +245,12 @@ def _pull_one(
         return added, [[place for _, _, place in read] for read in notes]
 
     pixels = grads[0].shape[-1]
+    # One for each plane: what the compiler makes of slices of one is another loop.
     probes = [
-        [grads[0].new_zeros(channels, sets, 1, 1, pixels) for _, channels, sets in each]
+        [
+            tuple(grads[0].new_zeros(sets, 1, 1, pixels) for _ in range(channels))
+            for _, channels, sets in each
+        ]
         for each in reads
     ]
     values, vjp, places = torch.func.vjp(probed, part.wanted, probes, has_aux=True)  # type: ignore[misc]
@@ -258,8 +262,8 @@ def _pull_one(
     parts, moved = vjp(grads[:num_summed] + tuple(due))
     lookups = [
         tuple(
-            (start, place.flatten().long(), gradient.flatten(1))
-            for (start, _, _), place, gradient in zip(*texture, strict=True)
+            (start, place.flatten().long(), tuple(gradient.flatten() for gradient in gradients))
+            for (start, _, _), place, gradients in zip(*texture, strict=True)
         )
         for texture in zip(reads, places, moved, strict=True)
     ]
@@ -269,7 +273,7 @@ def _pull_one(
 def _lookups(
     name: str,
     texture: Tensor,
-    probes: Sequence[Tensor] | None,
+    probes: Sequence[Planes] | None,
     read: list[tuple[int, int, Tensor]],
     color_from: int,
 ) -> Lookups:
@@ -283,15 +287,13 @@ def scatter(total: Tensor, moved: Moved) -> None:
         total: Gradient of the texture, (C, rows * W).
         moved: What lookups leave.
     """
-    for start, place, gradient in moved:
-        channels = gradient.shape[0]
-        rows = total[start : start + channels]
-        rows.scatter_add_(1, place.expand(channels, -1), gradient.to(total.dtype))
+    for start, place, gradients in moved:
+        for channel, gradient in zip(total[start:], gradients, strict=False):
+            channel.scatter_add_(0, place, gradient.to(total.dtype))
 
 
 def _scatter_in_kernel(total: Tensor, texture: Tensor, moved: Moved) -> None:
     size = texture.shape[1] * texture.shape[2]
-    for start, place, gradient in moved:
-        for channel in range(gradient.shape[0]):
-            index = (place + (start + channel) * size,)
-            total.view(-1).index_put_(index, gradient[channel], accumulate=True)
+    for start, place, gradients in moved:
+        for channel, gradient in enumerate(gradients, start):
+            total.view(-1).index_put_((place + channel * size,), gradient, accumulate=True)

@@ -199,9 +199,16 @@ class _Sum:
         return [slice(start, stop) for start, stop in itertools.pairwise(ends)]
 
     def part(self, tensor: Tensor, part: slice | None) -> Tensor:
-        """Return a part of a list, and anything else as it is."""
-        # A copy: views with offsets would each be compiled anew.
-        return tensor if part is None or not self.is_list(tensor) else tensor[..., part].clone()
+        """Return a part of a list, and anything else as it is.
+
+        It has the strides of its shape, no offset and no base: any other layout, even of dimensions
+        of one, would be compiled anew.
+        """
+        if not self.is_list(tensor):
+            return tensor
+        piece = tensor if part is None else tensor[..., part]
+        flat = piece.reshape(-1)
+        return (flat.clone() if flat.storage_offset() else flat).view(piece.shape).data
 
     def put(self, whole: Tensor, piece: Tensor, part: slice | None) -> Tensor:
         """Write a part of a list into the whole of it; anything else takes its place."""
