@@ -64,6 +64,10 @@ CASES = [
 
 @pytest.mark.parametrize(("depths", "lengths", "ports", "strict"), CASES)
 def test_mirror(depths, lengths, ports, strict):
-    pairs = [TapPair(*(numbers(v) for v in p)) for p in ((1, 2), depths, lengths)]
+    pairs = [TapPair(*(numbers(v) for v in p)) for p in (depths, lengths)]
+    weights = tuple((numbers(v), numbers(10 * v)) for v in (1, 2))
     for rule, expected in (("ports", ports), ("strict", strict), ("none", (1, 2))):
-        assert tuple(w.item() for w in mirror(*pairs, rule)) == expected
+        both = mirror(weights, *pairs, rule)
+        assert [tuple(w.item() for w in planes) for planes in both] == [
+            (v, 10 * v) for v in expected
+        ]

@@ -22,7 +22,7 @@ from torchblur.filters.reconstruction import resolve, texture_of
 from torchblur.filters.revealed import revealed_inputs
 from torchblur.filters.spreads import Spread
 from torchblur.frame import Frame
-from torchblur.ops.gather import Engine, Inputs, gather_lists
+from torchblur.ops.gather import Engine, Inputs, components, gather_lists
 from torchblur.ops.pixels import PixelList
 from torchblur.ops.velocity import direction, length
 from torchblur.ops.weights import power, saturate
@@ -117,7 +117,7 @@ def _layers(frame: Frame, values: Values, engine: Engine) -> dict[str, Tensor]:
     first, second, least = tile_planes(seen.color, spread.length, tiles, pixels, values)
     inputs = shared_inputs(here, texture_of(seen, spread), pixels, local)
     spread = Spread(*(pixels.pack(plane) for plane in spread))
-    inputs |= {"half": spread.half, "length": spread.length}
+    inputs |= components("half", spread.half) | {"length": spread.length}
     inputs["linear"] = (least >= local.bilinear_min).to(frame.dtype)
     inputs["fast"] = (least >= local.fast_ratio * length(first)).to(frame.dtype)
     inputs |= pixels.lists(
@@ -149,6 +149,11 @@ class _Way(NamedTuple):
     """Weight of the pixel's own direction along it, in [0, 1], (B, 1, H, W)."""
     vector: Tensor
     """Half spread that a sample must have, px, (B, 2, H, W)."""
+
+    def line(self, prefix: str = "") -> Inputs:
+        """Return what taps along it need."""
+        planes = {f"{prefix}reach": self.reach, f"{prefix}agrees": self.agrees}
+        return components(f"{prefix}unit", self.unit) | planes
 
 
 def _ways(first: Tensor, second: Tensor, spread: Spread, values: Values) -> dict[str, _Way]:
@@ -215,7 +220,7 @@ def _gather(
         found = []
         for name, line in lines.items():
             reach = ways[name].reach.clamp_min(SHORTEST_REACH)
-            inputs = shared | ways[name]._asdict() | {"reach": reach, "pairs": line.pairs}
+            inputs = shared | ways[name].line() | {"reach": reach, "pairs": line.pairs}
             totals = gather_lists(pair_tap, options, line.most_pairs, inputs, pixels, engine)
             area = values.area_slope * reach if values.accurate_alpha else None
             found.append(_means(totals, 2 * line.pairs, line, area, values))
@@ -223,12 +228,12 @@ def _gather(
     name, way = next(iter(ways.items()))
     line = lines[name]
     count = torch.full_like(line.pairs, float(values.num_samples))
-    inputs = dict(shared)
+    inputs, timed = dict(shared), values.sampling == "times"
     for name, one in ways.items():
-        inputs |= {f"{name}_{key}": plane for key, plane in one._asdict().items()}
-    tap = time_tap if values.sampling == "times" else alternate_tap
+        inputs |= components(f"{name}_vector", one.vector) if timed else one.line(f"{name}_")
+    tap = time_tap if timed else alternate_tap
     totals = gather_lists(tap, options, values.num_samples, inputs, pixels, engine)
-    if options.fill_hidden and values.sampling == "times":
+    if options.fill_hidden and timed:
         totals = (*fill_hidden(totals[0], totals[1], values.background_gain), *totals[2:])
     spreads = values.accurate_alpha and values.sampling == "alternate"
     area = values.area_slope * way.reach if spreads else None

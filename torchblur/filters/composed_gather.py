@@ -19,7 +19,7 @@ from torchblur.filters.reconstruction import (
 )
 from torchblur.frame import Frame, Shutter
 from torchblur.ops.cubic import second_differences
-from torchblur.ops.gather import Inputs, Planes, weighted
+from torchblur.ops.gather import Inputs, Planes, vector, weighted
 from torchblur.ops.pixels import PixelList
 from torchblur.ops.spread import Mirror, SpreadForm, TapPair, mirror, spread_weight
 from torchblur.ops.weights import DepthWeights, cone, cylinder, depth_weights, power, saturate
@@ -139,15 +139,17 @@ def alternate_tap(index: Tensor, count: Tensor, inputs: Inputs, options: TapOpti
     """Return what one tap adds; the directions take turns."""
     names = options.directions
     turn = torch.remainder(index, len(names))
-    unit, reach, own = (inputs[f"{names[0]}_{key}"] for key in ("unit", "reach", "agrees"))
+    dx, dy = vector(inputs, f"{names[0]}_unit")
+    reach, own = (inputs[f"{names[0]}_{key}"] for key in ("reach", "agrees"))
     for number, name in enumerate(names[1:], 1):
         mine = turn == number
-        unit = torch.where(mine, inputs[f"{name}_unit"], unit)
+        unit_x, unit_y = vector(inputs, f"{name}_unit")
+        dx, dy = torch.where(mine, unit_x, dx), torch.where(mine, unit_y, dy)
         reach = torch.where(mine, inputs[f"{name}_reach"], reach)
         own = torch.where(mine, inputs[f"{name}_agrees"], own)
     t = (2 * (index + 1 + inputs["shift"]) / (count + 1) - 1).clamp(-1, 1)
     per_px = 0.5 * count / reach.clamp_min(_TINY)
-    tap, weights = _tap(t, (unit, reach, own, per_px), inputs, options)
+    tap, weights = _tap(t, _Line(dx, dy, reach, own, per_px), inputs, options)
     if options.skip_middle_tap:
         weights = _Weights(*(w * (2 * index != count - 1) for w in weights))
     return _sums(tap, _plain(weights, inputs, options))
@@ -160,19 +162,20 @@ def pair_tap(index: Tensor, count: Tensor, inputs: Inputs, options: TapOptions) 
     """Return what two taps add, at equal times before and after the middle of the exposure."""
     pairs = inputs["pairs"]
     step, shift = (index + 0.5) / pairs, inputs["shift"] / pairs
-    line = inputs["unit"], inputs["reach"], inputs["agrees"], pairs / inputs["reach"]
+    reach = inputs["reach"]
+    line = _Line(*vector(inputs, "unit"), reach, inputs["agrees"], pairs / reach)
     times = [(side * step + shift).clamp(-1, 1) for side in (1, -1)]
     taps, weights = zip(*(_tap(t, line, inputs, options) for t in times), strict=True)
     mirrored = mirror(
-        TapPair(*(torch.cat(w, 1) for w in weights)),
+        weights,
         TapPair(*(tap.depth for tap in taps)),
         TapPair(*(tap.length for tap in taps)),
         options.mirror,
     )
     taken = (index < pairs).to(step.dtype)
     parts = []
-    for tap, joined in zip(taps, mirrored, strict=True):
-        plain = _plain(_Weights(*joined.split(1, 1)), inputs, options)
+    for tap, chosen in zip(taps, mirrored, strict=True):
+        plain = _plain(_Weights(*chosen), inputs, options)
         parts.append(_sums(tap, _Weights(*(taken * w for w in plain))))
     later, earlier = parts
     return (
@@ -226,26 +229,27 @@ def sample_classes(
     return classes._replace(foreground=1 - classes.background) if options.shares else classes
 
 
-def _tap(
-    t: Tensor, line: tuple[Tensor, Tensor, Tensor, Tensor], inputs: Inputs, options: TapOptions
-) -> tuple[Tap, _Weights]:
-    """Return what lies at a time t in [-1, 1] of a line, and its weights.
+class _Line(NamedTuple):
+    dx: Tensor
+    dy: Tensor
+    reach: Tensor
+    """Half spread of the tile, px."""
+    own: Tensor
+    """Agreement with the pixel's direction."""
+    per_px: Tensor
+    """Taps per px."""
 
-    Args:
-        t: Time.
-        line: Direction, half spread of the tile in px, agreement with the pixel's direction, and
-            taps per px.
-        inputs: The planes.
-        options: The switches.
-    """
-    unit, reach, own, per_px = line
+
+def _tap(t: Tensor, line: _Line, inputs: Inputs, options: TapOptions) -> tuple[Tap, _Weights]:
+    """Return what lies at a time t in [-1, 1] of a line, and its weights."""
+    dx, dy, reach, own, per_px = line
     along = (t + options.center) * reach
-    dx, dy = unit.split(1, 1)
     tap = sample(inputs, inputs["x"] - along * dx, inputs["y"] - along * dy, options.color_lookup)
     toward = tap.unit_x * dx + tap.unit_y * dy
     distance_s = distance_p = along.abs()
     if options.center:
-        moved_p = (inputs["half"] * unit).sum(1, keepdim=True)
+        half_x, half_y = vector(inputs, "half")
+        moved_p = half_x * dx + half_y * dy
         distance_s = (along - options.center * tap.length * toward).abs()
         distance_p = (along - options.center * moved_p).abs()
     classes = sample_classes(inputs["depth"], tap.depth, inputs, options)

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from torchblur.filters.composed_gather import Added, TapOptions, sample_classes, sum_planes
 from torchblur.filters.reconstruction import Tap, sample
-from torchblur.ops.gather import Inputs, Planes, read, weighted
+from torchblur.ops.gather import Inputs, Planes, read, vector, weighted
 from torchblur.ops.weights import saturate
 
 __all__ = ["fill_hidden", "time_tap"]
@@ -36,7 +36,8 @@ def time_tap(index: Tensor, count: Tensor, inputs: Inputs, options: TapOptions) 
     """
     time = (2 * (index + 0.5 + inputs["shift"]) / count - 1).clamp(-1, 1) + options.center
     found = [
-        _follow(inputs[f"{name}_vector"], time, inputs, options) for name in options.directions
+        _follow(vector(inputs, f"{name}_vector"), time, inputs, options)
+        for name in options.directions
     ]
     weights = []
     open_share = torch.ones_like(found[0].match)
@@ -78,9 +79,11 @@ def fill_hidden(back: Tensor, weight: Tensor, gain: Tensor) -> tuple[Tensor, Ten
     return gain * (color + filled), gain * (weight + hidden)
 
 
-def _follow(vector: Tensor, time: Tensor, inputs: Inputs, options: TapOptions) -> _Arrival:
+def _follow(
+    motion: tuple[Tensor, Tensor], time: Tensor, inputs: Inputs, options: TapOptions
+) -> _Arrival:
     """Return the sample that moves to the pixel from where this motion would bring it."""
-    dx, dy = vector.split(1, 1)
+    dx, dy = motion
     for _ in range(options.refinements):
         place = inputs["x"] - time * dx, inputs["y"] - time * dy
         ux, uy, size = read(inputs, *place, channels=slice(0, 3))
@@ -130,7 +133,7 @@ def _behind(
     time: Tensor, share: Tensor, inputs: Inputs, options: TapOptions
 ) -> tuple[Planes, Tensor, Tensor]:
     """Return color and weight of the tap on the pixel's own line behind it, and what is hidden."""
-    dx, dy = inputs["half"].split(1, 1)
+    dx, dy = vector(inputs, "half")
     tap = sample(inputs, inputs["x"] - time * dx, inputs["y"] - time * dy, options.color_lookup)
     behind = sample_classes(inputs["depth"], tap.depth, inputs, options).background
     gain = 1.0 if options.fill_hidden else inputs["background_gain"]  # there it comes after

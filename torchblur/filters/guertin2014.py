@@ -14,7 +14,16 @@ from torchblur.filters.reconstruction import WEIGHT_PARAMETERS, Tap, is_one, res
 from torchblur.filters.spreads import Spread, per_image, tiles_of
 from torchblur.frame import Frame, Shutter
 from torchblur.ops.color import luma
-from torchblur.ops.gather import Engine, Inputs, Lookup, Planes, gather_lists, weighted
+from torchblur.ops.gather import (
+    Engine,
+    Inputs,
+    Lookup,
+    Planes,
+    components,
+    gather_lists,
+    vector,
+    weighted,
+)
 from torchblur.ops.noise import checkerboard, noise_plane
 from torchblur.ops.tiles import tile_lookup, tile_variance
 from torchblur.ops.velocity import direction, length
@@ -140,12 +149,12 @@ def _tap_inputs(part: Moving, variance: Tensor | None) -> Inputs:
         "texture": part.texture,
         "x": x,
         "y": y,
-        **_components("w_n", w_n),
-        **_components("w_c", w_c),
+        **components("w_n", w_n),
+        **components("w_c", w_c),
         "reach": length(part.dominant),
         "jitter": (2 * noise - 1) * values.eta * values.phi / values.num_samples,
         "depth": frame.finite_depth(),
-        **_components("half", spread.half),
+        **components("half", spread.half),
         "length": spread.length,
         "length_p": length_p,
         # A for a tap along w_n and along w_c, which is one plane for all taps
@@ -164,12 +173,6 @@ def _tap_inputs(part: Moving, variance: Tensor | None) -> Inputs:
     for key in (*WEIGHT_PARAMETERS, "direction_exponent"):
         inputs[key] = getattr(values, key)
     return inputs
-
-
-def _components(name: str, plane: Tensor) -> Inputs:
-    """Return x and y apart: a tap that takes two channels apart makes a loop of its own of that."""
-    x, y = plane.split(1, 1)
-    return {f"{name}_x": x, f"{name}_y": y}
 
 
 def _options(values: Values) -> _Options:
@@ -217,11 +220,11 @@ def _luma(frame: Frame, moving: Tensor, kind: str, color: Tensor) -> Tensor:
 
 def _tap(index: Tensor, count: Tensor, inputs: Inputs, options: _Options) -> tuple[Planes, Tensor]:
     t = (2 * (index + 1 + inputs["jitter"]) / (count + 1) - 1).clamp(-1, 1)
-    dx, dy, reach, own = (inputs[key] for key in ("w_n_x", "w_n_y", "reach", "own_n"))
+    (dx, dy), reach, own = vector(inputs, "w_n"), inputs["reach"], inputs["own_n"]
     if options.two_directions:
         along_center = _takes_center_direction(index, inputs, options)
-        dx = torch.where(along_center, inputs["w_c_x"], dx)
-        dy = torch.where(along_center, inputs["w_c_y"], dy)
+        c_x, c_y = vector(inputs, "w_c")
+        dx, dy = torch.where(along_center, c_x, dx), torch.where(along_center, c_y, dy)
         own = torch.where(along_center, inputs["own_c"], own)
         if options.own_length:
             reach = torch.where(along_center, inputs["length"], reach)
@@ -255,7 +258,8 @@ def _weight(
     toward = tap.unit_x * dx + tap.unit_y * dy
     distance_s = distance_p = distance = along.abs()
     if options.center:
-        moved_p = inputs["half_x"] * dx + inputs["half_y"] * dy
+        half_x, half_y = vector(inputs, "half")
+        moved_p = half_x * dx + half_y * dy
         distance_s = (along - options.center * tap.length * toward).abs()
         distance_p = (along - options.center * moved_p).abs()
         distance = torch.where(length_s <= length_p, distance_s, distance_p)

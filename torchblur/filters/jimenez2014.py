@@ -14,7 +14,16 @@ from torchblur.filters.places import SHORTEST_REACH, num_pairs, tap_shift, tile_
 from torchblur.filters.reconstruction import Tap, sample
 from torchblur.filters.spreads import pixel_spread, tiles_of
 from torchblur.frame import Frame, Shutter
-from torchblur.ops.gather import Engine, Inputs, Lookup, Planes, gather_lists, weighted
+from torchblur.ops.gather import (
+    Engine,
+    Inputs,
+    Lookup,
+    Planes,
+    components,
+    gather_lists,
+    vector,
+    weighted,
+)
 from torchblur.ops.pixels import select, takes_all_pixels
 from torchblur.ops.spread import Mirror, SpreadForm, TapPair, depth_shares, mirror, spread_weight
 from torchblur.ops.tiles import neighbor_min, tile_lookup, tile_min
@@ -183,10 +192,10 @@ def _tap_inputs(part: Moving, shortest: Tensor) -> tuple[Inputs, Tensor]:
         "x": x,
         "y": y,
         "shift": tap_shift(color, values, pixels),
-        "direction": direction(part.dominant),
+        **components("direction", direction(part.dominant)),
         "reach": reach.clamp_min(SHORTEST_REACH),
         "depth": part.frame.finite_depth(),
-        "half": part.spread.half,
+        **components("half", part.spread.half),
         "length": part.spread.length,
     }
     for key in ("depth_scale", "depth_level", "spread_offset", "spread_slope"):
@@ -205,15 +214,17 @@ def _fill(frame: Frame, color: Tensor, alpha: Tensor) -> Tensor:
 
 def _pair(index: Tensor, count: Tensor, inputs: Inputs, options: _Options) -> tuple[Planes, Tensor]:
     times = _times(index, count, inputs)
-    taps, weights = zip(*(_tap(t, count, inputs, options) for t in times), strict=True)
-    mirrored = mirror(
-        TapPair(*weights),
-        TapPair(*(tap.depth for tap in taps)),
-        TapPair(*(tap.length for tap in taps)),
+    (one, one_weight), (other, other_weight) = (_tap(t, count, inputs, options) for t in times)
+    taps = one, other
+    (later,), (earlier,) = mirror(
+        ((one_weight,), (other_weight,)),
+        TapPair(one.depth, other.depth),
+        TapPair(one.length, other.length),
         options.mirror,
     )
-    colors = (weighted(w, tap.color) for w, tap in zip(mirrored, taps, strict=True))
-    totals = (w if t.valid is None else w * t.valid for w, t in zip(mirrored, taps, strict=True))
+    weights = later, earlier
+    colors = (weighted(w, tap.color) for w, tap in zip(weights, taps, strict=True))
+    totals = (w if t.valid is None else w * t.valid for w, t in zip(weights, taps, strict=True))
     return tuple(a + b for a, b in zip(*colors, strict=True)), torch.add(*totals)
 
 
@@ -238,7 +249,7 @@ def _times(index: Tensor, count: Tensor, inputs: Inputs) -> TapPair:
 def _look(time: Tensor, inputs: Inputs, options: _Options) -> tuple[Tap, Tensor]:
     """Return what lies at a time, and how far along the tile's motion that is, px."""
     along = (time + options.center) * inputs["reach"]
-    dx, dy = inputs["direction"].split(1, 1)
+    dx, dy = vector(inputs, "direction")
     x, y = inputs["x"] - along * dx, inputs["y"] - along * dy
     return sample(inputs, x, y, options.color_lookup), along
 
@@ -246,11 +257,11 @@ def _look(time: Tensor, inputs: Inputs, options: _Options) -> tuple[Tap, Tensor]
 def _tap(t: Tensor, count: Tensor, inputs: Inputs, options: _Options) -> tuple[Tap, Tensor]:
     """Return what lies at time t, in units of the reach, and its weight."""
     tap, along = _look(t, inputs, options)
-    d = inputs["direction"]
-    dx, dy = d.split(1, 1)
+    dx, dy = vector(inputs, "direction")
     distance_s = distance_p = along.abs()
     if options.center:
-        moved_p = (inputs["half"] * d).sum(1, keepdim=True)
+        half_x, half_y = vector(inputs, "half")
+        moved_p = half_x * dx + half_y * dy
         moved_s = tap.length * (tap.unit_x * dx + tap.unit_y * dy)
         distance_p = (along - options.center * moved_p).abs()
         distance_s = (along - options.center * moved_s).abs()

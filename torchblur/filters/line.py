@@ -9,7 +9,16 @@ from torch import Tensor
 
 from torchblur.filters.base import BlurFilter, FilterConfig, Values
 from torchblur.frame import LONGEST_SHUTTER, Frame, Shutter
-from torchblur.ops.gather import Engine, Inputs, Lookup, Planes, gather_lists, read
+from torchblur.ops.gather import (
+    Engine,
+    Inputs,
+    Lookup,
+    Planes,
+    components,
+    gather_lists,
+    read,
+    vector,
+)
 from torchblur.ops.pixels import PixelList
 from torchblur.params import Param
 
@@ -109,7 +118,7 @@ def _blur(frame: Frame, values: Values, engine: Engine) -> Tensor:
     color = pixels.pack(frame.color)
     inputs = {
         "texture": frame.color,
-        "half": pixels.pack(frame.velocity) * (pixels.pack(values.shutter) * 0.5),
+        **components("half", pixels.pack(frame.velocity) * (pixels.pack(values.shutter) * 0.5)),
         "x": x,
         "y": y,
         "center": frame.color.new_full((), center),
@@ -137,8 +146,7 @@ def _moving_pixels(frame: Frame) -> PixelList:
 def _tap(index: Tensor, count: Tensor, inputs: Inputs, options: _Options) -> tuple[Planes, Tensor]:
     # Time in units of half the open interval, measured from the frame: -1 .. 1 if centered.
     time = (2 * index + 1) / count - 1 + inputs["center"]
-    x = inputs["x"] - time * inputs["half"][:, :1]
-    y = inputs["y"] - time * inputs["half"][:, 1:]
-    planes = read(inputs, x, y, options.lookup)
+    dx, dy = vector(inputs, "half")
+    planes = read(inputs, inputs["x"] - time * dx, inputs["y"] - time * dy, options.lookup)
     # The fourth plane is the validity, by which the color is multiplied already.
     return planes[:3], planes[3] if len(planes) == 4 else torch.ones_like(planes[0])

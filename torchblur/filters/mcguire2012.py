@@ -19,7 +19,16 @@ from torchblur.filters.reconstruction import (
 from torchblur.filters.revealed import RevealedBackgroundConfig
 from torchblur.filters.spreads import tiles_of
 from torchblur.frame import Frame, Shutter
-from torchblur.ops.gather import Engine, Inputs, Lookup, Planes, gather_lists, weighted
+from torchblur.ops.gather import (
+    Engine,
+    Inputs,
+    Lookup,
+    Planes,
+    components,
+    gather_lists,
+    vector,
+    weighted,
+)
 from torchblur.ops.noise import noise_plane
 from torchblur.ops.velocity import direction, length
 from torchblur.ops.weights import cone, cylinder, depth_weights
@@ -149,11 +158,11 @@ def _tap_inputs(part: Moving) -> Inputs:
         "x": x,
         "y": y,
         "jitter": (noise - 0.5) * values.jitter,
-        "direction": direction(part.dominant),
+        **components("direction", direction(part.dominant)),
         "reach": length(part.dominant),
         "depth": part.frame.finite_depth(),
         "length": spread.length,
-        "unit": spread.unit,
+        **components("unit", spread.unit),
         "extent": values.soft_depth_extent,
     }
     return inputs | {key: getattr(values, key) for key in WEIGHT_PARAMETERS}
@@ -162,7 +171,7 @@ def _tap_inputs(part: Moving) -> Inputs:
 def _tap(index: Tensor, count: Tensor, inputs: Inputs, options: _Options) -> tuple[Planes, Tensor]:
     t = (2 * (index + 1 + inputs["jitter"]) / (count + 1) - 1).clamp(-1, 1)
     along = (t + options.center) * inputs["reach"]
-    dx, dy = inputs["direction"].split(1, 1)
+    dx, dy = vector(inputs, "direction")
     tap = sample(inputs, inputs["x"] - along * dx, inputs["y"] - along * dy, options.color_lookup)
     front, behind = depth_weights(
         inputs["depth"],
@@ -176,7 +185,7 @@ def _tap(index: Tensor, count: Tensor, inputs: Inputs, options: _Options) -> tup
     length_p = torch.maximum(inputs["length"], inputs["min_length"])
     distance_s = distance_p = along.abs()
     if options.center:
-        ux, uy = inputs["unit"].split(1, 1)
+        ux, uy = vector(inputs, "unit")
         moved_s = tap.length * (tap.unit_x * dx + tap.unit_y * dy)
         moved_p = inputs["length"] * (ux * dx + uy * dy)
         distance_s = (along - options.center * moved_s).abs()

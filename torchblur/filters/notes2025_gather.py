@@ -12,7 +12,7 @@ from torchblur.filters.places import SHORTEST_REACH, num_pairs, tap_shift
 from torchblur.filters.reconstruction import ColorLookup, Tap, sample, texture_of
 from torchblur.filters.spreads import Spread
 from torchblur.frame import Frame, Shutter
-from torchblur.ops.gather import Engine, Inputs, Planes, gather_lists, weighted
+from torchblur.ops.gather import Engine, Inputs, Planes, components, gather_lists, vector, weighted
 from torchblur.ops.pixels import PixelList
 from torchblur.ops.spread import Mirror, SpreadForm, TapPair, depth_shares, mirror, spread_weight
 from torchblur.ops.velocity import direction, length
@@ -124,7 +124,7 @@ def shared_inputs(
         "y": y,
         "shift": tap_shift(frame.color, values, pixels),
         "depth": pixels.pack(frame.finite_depth()),
-        "half": pixels.pack(spread.half),
+        **components("half", pixels.pack(spread.half)),
         "unit": pixels.pack(spread.unit),
         "length": pixels.pack(spread.length),
         "linear": linear.to(frame.dtype),
@@ -149,7 +149,7 @@ def gather_line(
     unit = direction(line.vector)
     own = (shared["unit"] * unit).sum(1, keepdim=True).abs()
     inputs = shared | {
-        "direction": unit,
+        **components("direction", unit),
         "reach": reach,
         "pairs": line.pairs,
         "own": power(own, shared["direction_exponent"]),
@@ -182,20 +182,20 @@ def _pair(
     times = TapPair(*((side * step + shift).clamp(-1, 1) for side in (1, -1)))
     taps, weights = zip(*(_tap(t, inputs, options) for t in times), strict=True)
     mirrored = mirror(
-        TapPair(*weights),
+        weights,
         TapPair(*(tap.depth for tap in taps)),
         TapPair(*(tap.length for tap in taps)),
         options.mirror,
     )
     taken = (index < inputs["pairs"]).to(step.dtype)
-    parts = [_parts(tap, taken * w) for tap, w in zip(taps, mirrored, strict=True)]
+    parts = [_parts(tap, weighted(taken, w)) for tap, w in zip(taps, mirrored, strict=True)]
     *sums, _ = (ahead + behind for ahead, behind in zip(*parts, strict=True))
     influence = torch.maximum(parts[0][-1], parts[1][-1])
     return tuple(sums[:3]), sums[3], tuple(sums[4:7]), sums[7], sums[8], influence
 
 
-def _parts(tap: Tap, weights: Tensor) -> Planes:
-    background, foreground, alpha = weights.split(1, 1)
+def _parts(tap: Tap, weights: Planes) -> Planes:
+    background, foreground, alpha = weights
     influence = torch.where(background + foreground > 0, tap.length, 0.0)
     colors = weighted(background, tap.color), weighted(foreground, tap.color)
     if tap.valid is not None:
@@ -203,20 +203,16 @@ def _parts(tap: Tap, weights: Tensor) -> Planes:
     return *colors[0], background, *colors[1], foreground, alpha, influence
 
 
-def _tap(t: Tensor, inputs: Inputs, options: _Options) -> tuple[Tap, Tensor]:
-    """Return what lies at a time t in [-1, 1], and its weights.
-
-    Returns:
-        The tap; weights as background and foreground, and its alpha, (B, 3, H, W).
-    """
-    reach, unit = inputs["reach"], inputs["direction"]
+def _tap(t: Tensor, inputs: Inputs, options: _Options) -> tuple[Tap, Planes]:
+    """Return what lies at a time t in [-1, 1]; weights as background, foreground, and its alpha."""
+    reach, (dx, dy) = inputs["reach"], vector(inputs, "direction")
     along = (t + options.center) * reach
-    dx, dy = unit.split(1, 1)
     tap = sample(inputs, inputs["x"] - along * dx, inputs["y"] - along * dy, options.color_lookup)
     toward = tap.unit_x * dx + tap.unit_y * dy
     distance_s = distance_p = along.abs()
     if options.center:
-        moved_p = (inputs["half"] * unit).sum(1, keepdim=True)
+        half_x, half_y = vector(inputs, "half")
+        moved_p = half_x * dx + half_y * dy
         distance_p = (along - options.center * moved_p).abs()
         distance_s = (along - options.center * tap.length * toward).abs()
     share = depth_shares(
@@ -235,7 +231,7 @@ def _tap(t: Tensor, inputs: Inputs, options: _Options) -> tuple[Tap, Tensor]:
     alpha = foreground
     if options.accurate_alpha:
         alpha = saturate(foreground / (1 + inputs["area_slope"] * tap.length), options.softness)
-    return tap, torch.cat(torch.broadcast_tensors(background, foreground, alpha), 1)
+    return tap, (background, foreground, alpha)
 
 
 def _spread(distance: Tensor, size: Tensor, inputs: Inputs, options: _Options) -> Tensor:

@@ -11,7 +11,17 @@ from torchblur.filters.base import Values
 from torchblur.filters.notes2025_gather import Blurred, Line
 from torchblur.filters.places import num_pairs
 from torchblur.frame import Frame
-from torchblur.ops.gather import Engine, Inputs, Planes, gather, pixel_grid, read, weighted
+from torchblur.ops.gather import (
+    Engine,
+    Inputs,
+    Planes,
+    components,
+    gather,
+    pixel_grid,
+    read,
+    vector,
+    weighted,
+)
 from torchblur.ops.pixels import PixelList
 from torchblur.ops.velocity import direction, length
 from torchblur.ops.weights import saturate
@@ -100,7 +110,7 @@ def _along(
     gap = length(line.vector) / num_pairs(values)
     most = max(values.post_samples // 2, 1)
     inputs = shared | {
-        "unit": direction(line.vector),
+        **components("unit", direction(line.vector)),
         "radius": values.post_radius * gap,
         "per_side": gap.detach().ceil().clamp(1, most),
         "used": line.used.to(gap.dtype),
@@ -128,7 +138,7 @@ def _post_tap(
     place = torch.floor(index / 2)
     side = 1 - 2 * torch.remainder(index, 2)
     step = side * inputs["radius"] * (place + 0.5) / inputs["per_side"]
-    dx, dy = (inputs["unit"] * step).split(1, 1)
+    dx, dy = (part * step for part in vector(inputs, "unit"))
     red, green, blue, alpha, output, usable = read(inputs, inputs["x"] + dx, inputs["y"] + dy)
     accepted, alive = _accept(alpha, inputs, options)
     taken = inputs["used"] * (place < inputs["per_side"])

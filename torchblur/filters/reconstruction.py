@@ -278,10 +278,10 @@ def sample(inputs: Inputs, x: Tensor, y: Tensor, color_lookup: ColorLookup) -> T
             fine = tuple(torch.where(linear, f, n) for f, n in zip(fine, near, strict=True))
         near = list(fine)
     tap = Tap(tuple(near[:3]), ux, uy, size, depth, near[3] if near[3:] else None)
-    if "revealed" not in inputs:
+    if "revealed_r" not in inputs:
         return tap
     share = background_share(inputs, x, y, depth)
-    behind = inputs["revealed"].split(1, 1)
+    behind = (inputs[f"revealed_{c}"] for c in "rgb")
     return tap._replace(
         color=tuple(c + share * (b - c) for c, b in zip(tap.color, behind, strict=True)),
         valid=None if tap.valid is None else tap.valid + share * (1 - tap.valid),

@@ -110,9 +110,9 @@ def revealed_inputs(
         blur: The filter itself, which blurs the revealed layer: frame and values to color.
 
     Returns:
-        "revealed" (B, 3, H, W), the layer's blurred color; "open" (B, 1, H, W), 1 where the frame
-        shows the layer itself and the layer has no holes, also as "texture_open"; "behind", the
-        slope of `behind_slope`.
+        "revealed_r", "revealed_g" and "revealed_b", the layer's blurred color; "open", 1 where the
+        frame shows the layer itself and the layer has no holes, also as "texture_open"; "behind",
+        the slope of `behind_slope`. Each (B, 1, H, W).
 
     Differentiable: in color, in the depth of both, and in `background_depth`.
     Raises: FrameError if there is no revealed layer, or it has no depth.
@@ -123,8 +123,12 @@ def revealed_inputs(
     # A layer with holes is blurred from what there is of it, which would show beside the object.
     whole = valid.amin((1, 2, 3), keepdim=True)
     shown = torch.where(_gap(frame, layer) > _LEAST_STEP, 0.0, whole.expand_as(valid))
+    color = blur(layer, Values(**(vars(values) | {"background": "guessed"})))
+    red, green, blue = color.split(1, 1)
     return {
-        "revealed": blur(layer, Values(**(vars(values) | {"background": "guessed"}))),
+        "revealed_r": red,
+        "revealed_g": green,
+        "revealed_b": blue,
         "open": shown,
         "texture_open": shown,
         "behind": behind_slope(frame, values.background_depth),

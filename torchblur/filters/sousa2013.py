@@ -18,7 +18,17 @@ from torchblur.filters.reconstruction import (
 )
 from torchblur.filters.spreads import Spread, Tiles, longest_spread, spread_of
 from torchblur.frame import Frame, Shutter
-from torchblur.ops.gather import Engine, Inputs, Lookup, Planes, gather, pixel_grid, weighted
+from torchblur.ops.gather import (
+    Engine,
+    Inputs,
+    Lookup,
+    Planes,
+    components,
+    gather,
+    pixel_grid,
+    vector,
+    weighted,
+)
 from torchblur.ops.noise import NoiseKind, noise_plane
 from torchblur.ops.pixels import PixelList
 from torchblur.ops.tiles import neighbor_max, tile_lookup, tile_max
@@ -200,10 +210,10 @@ def _pass(
         "x": x,
         "y": y,
         "jitter": (noise - 0.5) * values.jitter,
-        "direction": direction(dominant),
+        **components("direction", direction(dominant)),
         "reach": reach,
         "depth": frame.finite_depth(),
-        "half": spread.half,
+        **components("half", spread.half),
         "length_p": torch.maximum(spread.length, values.min_length),
         "extent": values.soft_depth_extent,
     }
@@ -220,8 +230,7 @@ def _pass(
 def _tap(index: Tensor, count: Tensor, inputs: Inputs, options: _Options) -> tuple[Planes, Tensor]:
     t = (2 * (index + 1 + inputs["jitter"]) / (count + 1) - 1).clamp(-1, 1)
     along = (t + options.center) * inputs["reach"]
-    d = inputs["direction"]
-    dx, dy = d.split(1, 1)
+    dx, dy = vector(inputs, "direction")
     tap = sample(inputs, inputs["x"] - along * dx, inputs["y"] - along * dy, options.color_lookup)
     front, behind = depth_weights(
         inputs["depth"],
@@ -234,7 +243,8 @@ def _tap(index: Tensor, count: Tensor, inputs: Inputs, options: _Options) -> tup
     distance_s = distance_p = along.abs()
     if options.center:
         moved_s = tap.length * (tap.unit_x * dx + tap.unit_y * dy)
-        moved_p = (inputs["half"] * d).sum(1, keepdim=True)
+        half_x, half_y = vector(inputs, "half")
+        moved_p = half_x * dx + half_y * dy
         distance_s = (along - options.center * moved_s).abs()
         distance_p = (along - options.center * moved_p).abs()
     length_s, length_p = torch.maximum(tap.length, inputs["min_length"]), inputs["length_p"]

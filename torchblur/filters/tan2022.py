@@ -21,7 +21,17 @@ from torchblur.filters.revealed import behind_slope, layer_behind, share_behind
 from torchblur.filters.spreads import Spread, Tiles, spread_of
 from torchblur.filters.tan2022_config import Tan2022Config
 from torchblur.frame import Frame, Shutter
-from torchblur.ops.gather import Engine, Inputs, Lookup, Planes, gather, pixel_grid, weighted
+from torchblur.ops.gather import (
+    Engine,
+    Inputs,
+    Lookup,
+    Planes,
+    components,
+    gather,
+    pixel_grid,
+    vector,
+    weighted,
+)
 from torchblur.ops.noise import noise_plane
 from torchblur.ops.pixels import PixelList
 from torchblur.ops.raymask import RayMask, edge_strength, ray_mask, uncovered
@@ -196,7 +206,7 @@ def _gather(
         "x": x,
         "y": y,
         "jitter": (noise - 0.5) * values.jitter,
-        "direction": direction(dominant),
+        **components("direction", direction(dominant)),
         "reach": reach,
         "depth": frame.finite_depth(),
         "length": torch.maximum(scaled.length, values.min_length),
@@ -248,7 +258,7 @@ def _tap(
     if options.side == 0:
         t = 2 * t - 1
     along = t * inputs["reach"]
-    dx, dy = ((options.side or 1) * inputs["direction"]).split(1, 1)
+    dx, dy = ((options.side or 1) * part for part in vector(inputs, "direction"))
     tap = sample(inputs, inputs["x"] - along * dx, inputs["y"] - along * dy, options.color_lookup)
     front, back = _weights(along.abs(), tap, inputs, options)
     valid = 1.0 if tap.valid is None else tap.valid

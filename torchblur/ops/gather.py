@@ -29,12 +29,14 @@ __all__ = [
     "Planes",
     "Storage",
     "TapFunction",
+    "components",
     "gather",
     "gather_lists",
     "lookup",
     "pixel_grid",
     "read",
     "stored_as",
+    "vector",
     "weighted",
 ]
 
@@ -179,6 +181,25 @@ def read(
         pairs = zip(*(_at(texture, column, row) for column in columns), strict=True)
         rows.append([torch.lerp(a, b, dx) for a, b in pairs])
     return _split(tuple(torch.lerp(a, b, dy) for a, b in zip(*rows, strict=True)))
+
+
+def components(name: str, plane: Tensor) -> Inputs:
+    """Return a vector as two inputs of a gather, which taps get by `vector`.
+
+    Two channels of one input would be taken apart in each tap, and the compiler would make a loop
+    of its own of putting their gradients together.
+
+    Args:
+        name: Of the vector.
+        plane: Its x and y, (B, 2, H, W).
+    """
+    x, y = plane.split(1, 1)
+    return {f"{name}_x": x, f"{name}_y": y}
+
+
+def vector(inputs: Inputs, name: str) -> tuple[Tensor, Tensor]:
+    """Return x and y of a vector among the inputs of a tap, (P, 1, 1, M) each."""
+    return inputs[f"{name}_x"], inputs[f"{name}_y"]
 
 
 def weighted(weight: Tensor, planes: Planes) -> Planes:

@@ -86,19 +86,24 @@ class TapPair(NamedTuple):
     earlier: Tensor
 
 
-def mirror(weights: TapPair, depths: TapPair, lengths: TapPair, rule: Mirror = "ports") -> TapPair:
-    """Copy the weight of the nearer and faster of two taps to the other.
+def mirror(
+    weights: tuple[tuple[Tensor, ...], tuple[Tensor, ...]],
+    depths: TapPair,
+    lengths: TapPair,
+    rule: Mirror = "ports",
+) -> tuple[tuple[Tensor, ...], tuple[Tensor, ...]]:
+    """Copy the weights of the nearer and faster of two taps to the other.
 
     Beside a moving object one tap of a pair falls on it and the other on the background. With
     the object's weight for both, what shows through the blur is the background around the
     pixel, as smooth as the blur, and not the pixel's own color alone.
 
     Args:
-        weights: Weights of the two taps, (B, 1, H, W).
+        weights: Those of the later and of the earlier tap, (B, 1, H, W) each.
         depths: Z of both, scene units.
         lengths: Half spread |V| of both, px.
         rule: "ports": the earlier tap counts as nearer if strictly so, and as faster if strictly
-            so; with both its weight is taken for both taps, with neither the later one's (so
+            so; with both its weights are taken for both taps, with neither the later one's (so
             ties depend on the order of the two). "strict": only where one tap is strictly
             nearer and strictly faster. "none": the weights as they are.
 
@@ -112,6 +117,9 @@ def mirror(weights: TapPair, depths: TapPair, lengths: TapPair, rule: Mirror = "
         not_nearer, not_faster = ~nearer, ~faster
     else:
         not_nearer, not_faster = depths.later < depths.earlier, lengths.earlier < lengths.later
-    later = torch.where(nearer & faster, weights.earlier, weights.later)
-    earlier = torch.where(not_nearer & not_faster, weights.later, weights.earlier)
-    return TapPair(later, earlier)
+    take_earlier, take_later = nearer & faster, not_nearer & not_faster
+    pairs = list(zip(*weights, strict=True))
+    return (
+        tuple(torch.where(take_earlier, b, a) for a, b in pairs),
+        tuple(torch.where(take_later, a, b) for a, b in pairs),
+    )
