@@ -92,7 +92,7 @@ def test_what_moves_alone_gives_what_all_pixels_give(monkeypatch, name, batch_si
     for dense in (False, True):
         if dense:
             monkeypatch.setattr("torchblur.ops.pixels._DENSE", -1.0)
-            monkeypatch.setattr("torchblur.filters.moving._ALMOST_ALL", -1.0)
+            monkeypatch.setattr("torchblur.ops.pixels._ALMOST_ALL", -1.0)
         blur = without_notices(make(name).double())
         leaf = frame.color.clone().requires_grad_()
         given = dataclasses.replace(frame, color=leaf)
@@ -113,7 +113,7 @@ def test_pixels_that_stray_to_a_moving_tile_are_blurred(monkeypatch, name):
     with torch.no_grad():
         sparse = straying(frame)
         monkeypatch.setattr("torchblur.ops.pixels._DENSE", -1.0)
-        monkeypatch.setattr("torchblur.filters.moving._ALMOST_ALL", -1.0)
+        monkeypatch.setattr("torchblur.ops.pixels._ALMOST_ALL", -1.0)
         dense = straying(frame)
         straight = make(name, noise="gradient", **dict.fromkeys(stray, 0.0)).double()(frame)
     assert torch.allclose(sparse, dense, rtol=0, atol=1e-9)
@@ -146,7 +146,7 @@ def test_textures_without_what_no_tap_reaches(monkeypatch, name, batch_size, loo
     for dense in (False, True):
         if dense:
             monkeypatch.setattr("torchblur.ops.pixels._DENSE", -1.0)
-            monkeypatch.setattr("torchblur.filters.moving._ALMOST_ALL", -1.0)
+            monkeypatch.setattr("torchblur.ops.pixels._ALMOST_ALL", -1.0)
         leaf = frame.color.clone().requires_grad_()
         textures.clear()
         image = blur(dataclasses.replace(frame, color=leaf), shutter=shutter)
@@ -170,7 +170,7 @@ def test_parameters_of_all_shapes(monkeypatch, name, kind):
     with torch.no_grad():
         image = make(name)(frame, **{parameter: value})
         monkeypatch.setattr("torchblur.ops.pixels._DENSE", -1.0)
-        monkeypatch.setattr("torchblur.filters.moving._ALMOST_ALL", -1.0)
+        monkeypatch.setattr("torchblur.ops.pixels._ALMOST_ALL", -1.0)
         whole = make(name)(frame, **{parameter: value})
         for i in range(2) if kind != "per pixel" else ():
             single = frame.map(lambda t, i=i: t[i : i + 1]) if kind == "per image" else frame

@@ -9,6 +9,7 @@ from torchblur.testing.frames import moving_square, random_frame
 ONE = {"directions": "one", "depth_level": 0.5, "direction_weights": False}
 HALF = {"resolution": "half"}
 GAPS = {"num_samples": 4, "shutter": 1.5}  # gaps of some pixels for the post-filter to fill
+ALIKE = {"tile_size": 2, "shutter": 0.8, "directions": "one"}
 SOFT = GAPS | {"post_acceptance": "soft"}
 
 
@@ -26,6 +27,8 @@ class TestNotes2025(FilterContract):
         "secondary_exponent": {"tile_size": 8},
         "neighbor_culling": {"tile_size": 8},
         "min_angle": {"tile_size": 4},
+        "tile_classes": ALIKE,
+        "fast_ratio": ALIKE | {"tile_classes": True},
         "mirror_filter": {"velocity_encoding": "uint8"},  # the rules differ where speeds tie
         **{
             f"post_{name}": GAPS
@@ -335,3 +338,58 @@ class TestHalfResolution:
             rtol=1e-4,
             fast_mode=True,
         )
+
+
+@pytest.mark.parametrize("level", [1.0, 0.5])
+@pytest.mark.parametrize("directions", ["one", "two"])
+def test_fast_tiles_are_the_full_ones_where_all_moves_alike(directions, level):
+    # An optimization: at one depth and with one motion all weights are what the fast class takes.
+    torch.manual_seed(3)
+    color = torch.rand(1, 3, 40, 60)
+    velocity = torch.tensor((13.0, -6.0)).view(1, 2, 1, 1).expand(1, 2, 40, 60)
+    frame = Frame(color=color, velocity=velocity, depth=torch.full((1, 1, 40, 60), 5.0))
+    params = {"directions": directions, "depth_level": level, "noise": "none"}
+    full = Notes2025Blur(**params).layers(frame)
+    fast = Notes2025Blur(**params, tile_classes=True).layers(frame)
+    for key in ("color", "alpha", "output_alpha", "weight", "influence"):
+        assert torch.allclose(fast[key], full[key], atol=1e-6), key
+    # Alpha is the share of the foreground: the color is the same mean at any depths.
+    apart = frame.replaced(depth=1 + 50 * torch.rand(1, 1, 40, 60))
+    params["post_filter"] = False
+    full, fast = (Notes2025Blur(**params, tile_classes=on).layers(apart) for on in (False, True))
+    assert torch.allclose(fast["color"], full["color"], atol=1e-6)
+    assert not torch.allclose(fast["alpha"], full["alpha"], atol=1e-2)
+
+
+def test_fast_tiles_need_one_direction_of_motion():
+    torch.manual_seed(3)
+    velocity = torch.zeros(1, 2, 40, 60)
+    velocity[:, 0, ::2], velocity[:, 1, 1::2] = 12.0, 12.0
+    depth = torch.full((1, 1, 40, 60), 5.0)
+    frame = Frame(color=torch.rand(1, 3, 40, 60), velocity=velocity, depth=depth)
+    assert torch.equal(Notes2025Blur(tile_classes=True)(frame), Notes2025Blur()(frame))
+    one = {"directions": "one"}
+    assert not torch.allclose(
+        Notes2025Blur(**one, tile_classes=True)(frame), Notes2025Blur(**one)(frame), atol=1e-3
+    )
+
+
+def test_directions_and_classes_cost_only_where_they_are_used(monkeypatch):
+    from torchblur.ops import gather as gathers
+
+    done = []
+    plain = gathers.gather_lists
+
+    def counted(tap, options, num_samples, lists, pixels, *args, **kwargs):
+        done.append((tap.__name__, pixels.count))
+        return plain(tap, options, num_samples, lists, pixels, *args, **kwargs)
+
+    monkeypatch.setattr(gathers, "gather_lists", counted)
+    frame = moving_square(40, 60)
+    frame = frame.replaced(velocity=torch.full_like(frame.velocity, 9.0))
+    with torch.no_grad():
+        Notes2025Blur(post_filter=False)(frame)
+        assert done == [("_pair", 2400), ("_pair", 0)]
+        done.clear()
+        Notes2025Blur(post_filter=False, tile_classes=True)(frame)
+        assert done == [("_pair", 0), ("_plain_pair", 2400), ("_pair", 0)]

@@ -40,6 +40,8 @@ DEFAULTS = {
     "depth_level": 1.0,
     "direction_weights": True,
     "direction_exponent": 3.0,
+    "tile_classes": False,
+    "fast_ratio": 0.9,
     "alpha_combination": "max",
     "accurate_alpha": True,
     "area_slope": 2.0,
@@ -109,7 +111,9 @@ def blur(color, depth, velocity, settings):
             tx, ty = tile_of(x, y, (len(first), len(first[0])), settings)
             linear = least[ty][tx] >= settings.bilinear_min
             lines = lines_of[y, x] = lines_at(first[ty][tx], second[ty][tx], linear, settings)
+            alike = least[ty][tx] >= settings.fast_ratio * length(first[ty][tx])
             pixel = SimpleNamespace(x=x, y=y, color=color, depth=depth, field=field, linear=linear)
+            pixel.fast = settings.tile_classes and len(lines) == 1 and alike
             image[:, y, x] = main_pass(pixel, lines, settings)
     layers = {"alpha": image[3:4].copy()}
     if settings.post_filter:
@@ -304,12 +308,15 @@ def tap(pixel, t, d, reach, pairs, settings):
     x, y = pixel.x - position * d[0], pixel.y - position * d[1]
     column, row = common.nearest(x, y, *pixel.depth.shape)
     v_p, v_s = pixel.field[pixel.y][pixel.x], pixel.field[row][column]
-    bg, fg = depth_weights(pixel.depth[pixel.y, pixel.x], pixel.depth[row, column], settings)
-    bg *= spread(position, v_p, d, pairs / reach, settings)
-    fg *= spread(position, v_s, d, pairs / reach, settings)
-    if settings.direction_weights:
-        bg *= abs(dot(d, direction_of(v_p))) ** settings.direction_exponent
-        fg *= abs(dot(d, direction_of(v_s))) ** settings.direction_exponent
+    if pixel.fast:  # all count as at one depth and as moving along the tile's motion
+        v_s, bg, fg = (d[0] * reach, d[1] * reach), settings.depth_level, 1 - settings.depth_level
+    else:
+        bg, fg = depth_weights(pixel.depth[pixel.y, pixel.x], pixel.depth[row, column], settings)
+        bg *= spread(position, v_p, d, pairs / reach, settings)
+        fg *= spread(position, v_s, d, pairs / reach, settings)
+        if settings.direction_weights:
+            bg *= abs(dot(d, direction_of(v_p))) ** settings.direction_exponent
+            fg *= abs(dot(d, direction_of(v_s))) ** settings.direction_exponent
     bilinear = settings.color_lookup == "bilinear"
     bilinear = bilinear or (settings.color_lookup == "opportunistic" and pixel.linear)
     return SimpleNamespace(

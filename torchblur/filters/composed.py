@@ -18,7 +18,7 @@ from torchblur.filters.moving import moving_pixels, packed_values, tile_planes
 from torchblur.filters.notes2025_gather import Blurred, Line, Sums, compose
 from torchblur.filters.notes2025_postfilter import post_filter
 from torchblur.filters.places import SHORTEST_REACH, num_pairs
-from torchblur.filters.reconstruction import resolve, texture_of
+from torchblur.filters.reconstruction import color_from, resolve, texture_of
 from torchblur.filters.revealed import revealed_inputs
 from torchblur.filters.spreads import Spread
 from torchblur.frame import Frame
@@ -116,6 +116,7 @@ def _layers(frame: Frame, values: Values, engine: Engine) -> dict[str, Tensor]:
     here, local = seen.only("depth", "valid").map(pixels.pack), packed_values(values, pixels)
     first, second, least = tile_planes(seen.color, spread.length, tiles, pixels, values)
     inputs = shared_inputs(here, texture_of(seen, spread), pixels, local)
+    first_channel = color_from(seen, spread)
     spread = Spread(*(pixels.pack(plane) for plane in spread))
     inputs |= components("half", spread.half) | {"length": spread.length}
     inputs["linear"] = (least >= local.bilinear_min).to(frame.dtype)
@@ -126,7 +127,7 @@ def _layers(frame: Frame, values: Values, engine: Engine) -> dict[str, Tensor]:
     moving = length(first) > local.early_out
     ways = _ways(first, second, spread, local)
     lines = _lines(ways, inputs["linear"] > 0, moving, local)
-    sums = _gather(ways, lines, inputs, pixels, local, engine)
+    sums = _gather(ways, lines, inputs, pixels, local, engine, first_channel)
     image = _resolve(here, sums, spread, moving, local).images(frame, pixels)
     if values.post_filter:
         wide = [line.image(pixels) for line in lines.values()]
@@ -213,6 +214,7 @@ def _gather(
     pixels: PixelList,
     values: Values,
     engine: Engine,
+    first_channel: int,
 ) -> list[Sums]:
     """Return the means over the taps: of each line if in pairs, else of all together."""
     options = tap_options(values, tuple(ways))
@@ -221,7 +223,9 @@ def _gather(
         for name, line in lines.items():
             reach = ways[name].reach.clamp_min(SHORTEST_REACH)
             inputs = shared | ways[name].line() | {"reach": reach, "pairs": line.pairs}
-            totals = gather_lists(pair_tap, options, line.most_pairs, inputs, pixels, engine)
+            totals = gather_lists(
+                pair_tap, options, line.most_pairs, inputs, pixels, engine, color_from=first_channel
+            )
             area = values.area_slope * reach if values.accurate_alpha else None
             found.append(_means(totals, 2 * line.pairs, line, area, values))
         return found
@@ -232,7 +236,9 @@ def _gather(
     for name, one in ways.items():
         inputs |= components(f"{name}_vector", one.vector) if timed else one.line(f"{name}_")
     tap = time_tap if timed else alternate_tap
-    totals = gather_lists(tap, options, values.num_samples, inputs, pixels, engine)
+    totals = gather_lists(
+        tap, options, values.num_samples, inputs, pixels, engine, color_from=first_channel
+    )
     if options.fill_hidden and timed:
         totals = (*fill_hidden(totals[0], totals[1], values.background_gain), *totals[2:])
     spreads = values.accurate_alpha and values.sampling == "alternate"

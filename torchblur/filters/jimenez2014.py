@@ -20,11 +20,10 @@ from torchblur.ops.gather import (
     Lookup,
     Planes,
     components,
-    gather_lists,
+    gather_some,
     vector,
     weighted,
 )
-from torchblur.ops.pixels import select, takes_all_pixels
 from torchblur.ops.spread import Mirror, SpreadForm, TapPair, depth_shares, mirror, spread_weight
 from torchblur.ops.tiles import neighbor_min, tile_lookup, tile_min
 from torchblur.ops.velocity import direction, length, quantize_uint8
@@ -142,32 +141,21 @@ def _sums(
         inputs: Of the taps, as lists.
         engine: Of the gathers.
     """
-    color = alpha = tile_class.new_zeros(())
-    pixels = part.pixels
-    for number, tap in ((1, _plain_pair), (2, _pair)):
-        if takes_all_pixels():
-            sums = gather_lists(tap, options, pairs, inputs, pixels, engine)
-            color, alpha = (
-                torch.where(tile_class == number, new, whole)
-                for whole, new in zip((color, alpha), sums, strict=True)
-            )
-            continue
-        chosen = (tile_class == number).flatten().nonzero()[:, 0]
-        if chosen.shape[0] == 0 and (number == 1 or color.ndim):
-            continue
-        some = {
-            name: select(plane, chosen)
-            if not name.startswith("texture") and plane.shape[3:] == (pixels.count,)
-            else plane
-            for name, plane in inputs.items()
-        }
-        sums = gather_lists(
-            tap, options, pairs, some, pixels.some(chosen), engine, color_from=part.color_from
+    kinds = [(2, _pair)] + ([(1, _plain_pair)] if part.values.tile_classes else [])
+    found = [
+        gather_some(
+            tap,
+            options,
+            pairs,
+            inputs,
+            part.pixels,
+            tile_class == number,
+            engine,
+            color_from=part.color_from,
         )
-        color, alpha = (
-            whole + new.new_zeros(*new.shape[:3], pixels.count).index_copy(3, chosen, new)
-            for whole, new in zip((color, alpha), sums, strict=True)
-        )
+        for number, tap in kinds
+    ]
+    color, alpha = (sum(sums[1:], sums[0]) for sums in zip(*found, strict=True))
     return color, alpha
 
 

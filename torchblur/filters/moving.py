@@ -12,14 +12,14 @@ from torch import Tensor
 
 from torchblur.filters.base import Values
 from torchblur.filters.places import tile_noise
-from torchblur.filters.reconstruction import TEXTURE_COLOR, texture_of
+from torchblur.filters.reconstruction import color_from, texture_of
 from torchblur.filters.revealed import revealed_inputs
 from torchblur.filters.spreads import Spread, pixel_spread
 from torchblur.frame import Frame
 from torchblur.ops.directions import TileDirections
 from torchblur.ops.gather import Inputs
 from torchblur.ops.noise import NoiseKind, noise_plane
-from torchblur.ops.pixels import PixelList, select, takes_all_pixels
+from torchblur.ops.pixels import PixelList, positions, select, takes_all_pixels
 from torchblur.ops.tiles import neighbor_min, tile_lookup, tile_min, tile_offset
 from torchblur.ops.velocity import length
 
@@ -36,8 +36,6 @@ __all__ = [
     "revealed_part",
     "tile_planes",
 ]
-
-_ALMOST_ALL = 0.95  # from here on a choice costs more than it saves
 
 
 class Filtered(NamedTuple):
@@ -178,9 +176,8 @@ def moving_part(
         there, read = there.map(listed.pack), packed_values(values, listed, window)
         texture = listed.unpack(texture_of(there, pixel_spread(there, read, uint8=uint8)))
         pixels = replace(pixels, origin=(window.top, window.left))
-    motion = (frame.velocity, values.shutter, frame.finite_depth())
-    color_from = 0 if any(plane.requires_grad for plane in motion) else TEXTURE_COLOR
-    return Moving(pixels, here, local, dominant, shift, spread, texture, window, color_from)
+    least = color_from(frame, spread)
+    return Moving(pixels, here, local, dominant, shift, spread, texture, window, least)
 
 
 def moving_tiles(frame: Frame, values: Values, neighborhood: Tensor) -> Tensor:
@@ -198,13 +195,10 @@ def moving_tiles(frame: Frame, values: Values, neighborhood: Tensor) -> Tensor:
 
 def moving_among(dominant: Tensor, least: Tensor) -> Tensor | None:
     """Return which pixels of a list move, for any set; None: so many that all may be taken."""
-    if takes_all_pixels():
-        return None
-    moving = (length(dominant.detach()) > least).any(0).flatten()
-    count = int(moving.sum())
-    if count > _ALMOST_ALL * moving.shape[0] or (count == 0 and torch.is_grad_enabled()):
-        return None
-    return moving.nonzero()[:, 0]
+    chosen = positions(length(dominant.detach()) > least)
+    if chosen is not None and chosen.shape[0] == 0 and torch.is_grad_enabled():
+        return None  # so that there is a graph
+    return chosen
 
 
 def moving_pixels(frame: Frame, tiles: TileDirections, values: Values) -> PixelList:

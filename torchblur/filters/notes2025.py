@@ -22,6 +22,7 @@ from torchblur.filters.notes2025_gather import (
 )
 from torchblur.filters.notes2025_postfilter import post_filter
 from torchblur.filters.places import num_pairs
+from torchblur.filters.reconstruction import color_from
 from torchblur.filters.revealed import layer_behind, revealed_inputs
 from torchblur.filters.spreads import Spread, exact_spread, longest_spread, tile_motions
 from torchblur.frame import Frame
@@ -61,9 +62,10 @@ def notes2025(frame: Frame, config: Notes2025Config | None = None, **params: Any
         a gap: depth ranges are guesses; the spread weight gives static pixels no background, or
         the half resolution would never keep a sharp one; the second direction is reduced exactly
         unless asked otherwise; with one sum for both (not `separate_sums`) two directions share
-        it; the alpha fade works in full-resolution px; taps and center of the post-filter; there
-        is no fast class of tiles, which changes cost only; shutters that are not centered shift
-        the taps along the velocity.
+        it; the alpha fade works in full-resolution px; taps and center of the post-filter; the
+        fast class of tiles is off unless asked for (`tile_classes`), as it gains little here (it
+        saves at most a sixth), and asks for one direction of motion, too; shutters that are not
+        centered shift the taps along the velocity.
     Raises: ConfigError for a bad parameter, FrameError if the frame has no depth.
     """
     result: Tensor = Notes2025Blur(config, **params)(frame)
@@ -106,10 +108,11 @@ def _layers(frame: Frame, values: Values, engine: Engine) -> dict[str, Tensor]:
     here, local = frame.only("depth", "valid").map(pixels.pack), packed_values(values, pixels)
     first, second, least = planes
     linear = least >= local.bilinear_min
-    lines = _lines(first, second, linear, local)
+    lines = _lines(first, second, least, local)
     shared = shared_inputs(frame, spread, linear, pixels, local)
     shared |= pixels.lists(revealed_inputs(frame, values, lambda f, v: _whole(f, v, engine)))
-    sums = [gather_line(shared, line, local, engine, pixels) for line in lines]
+    first_channel = color_from(frame, spread)
+    sums = [gather_line(shared, line, local, engine, pixels, first_channel) for line in lines]
     blurred = compose(here, sums, lines[0].used, local)
     if values.resolution == "half" and values.alpha_fade:
         blurred = _faded(blurred, local)
@@ -159,20 +162,23 @@ def _motion(frame: Frame, values: Values) -> tuple[Spread, TileDirections]:
     return exact_spread(half), tiles
 
 
-def _lines(first: Tensor, second: Tensor, linear: Tensor, values: Values) -> list[Line]:
-    """Return the directions that are sampled, and how densely."""
+def _lines(first: Tensor, second: Tensor, least: Tensor, values: Values) -> list[Line]:
+    """Return the directions that are sampled, how densely, and where taps need no weights."""
     pairs = num_pairs(values)
     plane = torch.full_like(first[:, :1], float(pairs))
-    moving = length(first) > values.early_out
-    doubled = torch.where(linear, plane, 2 * plane) if values.double_samples else plane
-    lines = [Line(first, moving, doubled, 2 * pairs if values.double_samples else pairs)]
+    moving, alike = length(first) > values.early_out, least >= values.fast_ratio * length(first)
+    doubled, most = plane, pairs
+    if values.double_samples:
+        linear = least >= values.bilinear_min
+        doubled, most = torch.where(linear, plane, 2 * plane), 2 * pairs
+    others = []
     if values.directions == "two":
         unit = direction(first) * direction(second)
         cosine = unit.sum(1, keepdim=True).abs()
         apart = cosine < torch.cos(values.min_angle * (math.pi / 180))
         used = moving & apart & (length(second) > values.early_out)
-        lines.append(Line(second, used, plane, pairs))
-    return lines
+        others, alike = [Line(second, used, plane, pairs)], alike & ~used
+    return [Line(first, moving, doubled, most, alike if values.tile_classes else None), *others]
 
 
 # -- half resolution -------------------------------------------------------------------------------

@@ -144,6 +144,14 @@ class Notes2025Config(RevealedBackgroundConfig):
         low=0.1, high=16.0, scale="log", grad="smooth", source=_SECOND,
         meaning="exponent of the direction weights",
     )] = 3.0
+    tile_classes: Annotated[bool, Param(
+        grad="discrete", source=f"{_BASE}; off: torchblur",
+        meaning="average plainly, without weights, where all tiles move alike",
+    )] = False
+    fast_ratio: Annotated[float, Param(
+        low=0.05, high=1.0, grad="weak", source="1/4 in Unity HDRP, 0.65 in G3D",
+        meaning="tile_classes: shortest half spread in reach over the longest, at least",
+    )] = 0.9
     alpha_combination: Annotated[Literal["max", "mean"], Param(
         grad="discrete", source=f"max: {_SECOND}; mean: torchblur, for comparison",
         meaning="alpha of the two directions together",

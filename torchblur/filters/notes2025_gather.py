@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
@@ -12,7 +14,7 @@ from torchblur.filters.places import SHORTEST_REACH, num_pairs, tap_shift
 from torchblur.filters.reconstruction import ColorLookup, Tap, sample, texture_of
 from torchblur.filters.spreads import Spread
 from torchblur.frame import Frame, Shutter
-from torchblur.ops.gather import Engine, Inputs, Planes, components, gather_lists, vector, weighted
+from torchblur.ops.gather import Engine, Inputs, Planes, components, gather_some, vector, weighted
 from torchblur.ops.pixels import PixelList
 from torchblur.ops.spread import Mirror, SpreadForm, TapPair, depth_shares, mirror, spread_weight
 from torchblur.ops.velocity import direction, length
@@ -56,6 +58,8 @@ class Line(NamedTuple):
     """Pairs of taps, (B, 1, H, W)."""
     most_pairs: int
     """The most that any pixel has."""
+    plain: Tensor | None = None
+    """Whether all that its taps may meet moves alike, bool, (B, 1, H, W); None: nowhere."""
 
     def image(self, pixels: PixelList) -> Line:
         """Return images of the lists, 0 elsewhere; the pairs stay as they are."""
@@ -134,7 +138,12 @@ def shared_inputs(
 
 
 def gather_line(
-    shared: Inputs, line: Line, values: Values, engine: Engine, pixels: PixelList
+    shared: Inputs,
+    line: Line,
+    values: Values,
+    engine: Engine,
+    pixels: PixelList,
+    color_from: int = 0,
 ) -> Sums:
     """Sample along one line and return the means, lists; zero where the line is not used.
 
@@ -144,6 +153,7 @@ def gather_line(
         values: The parameters, as in `shared_inputs`.
         engine: Of the gather.
         pixels: The pixels.
+        color_from: Of the texture's channels before this one no gradient is wanted.
     """
     reach = length(line.vector).clamp_min(SHORTEST_REACH)
     unit = direction(line.vector)
@@ -164,31 +174,68 @@ def gather_line(
         values.softness,
         values.color_lookup,
     )
-    *totals, influence = gather_lists(
-        _pair, options, line.most_pairs, inputs, pixels, engine, num_maxima=1
-    )
+    kinds = [(_pair, line.used)]
+    if line.plain is not None:
+        kinds = [(_pair, line.used & ~line.plain), (_plain_pair, line.used & line.plain)]
+    found = [
+        gather_some(
+            tap,
+            options,
+            line.most_pairs,
+            inputs,
+            pixels,
+            wanted,
+            engine,
+            num_maxima=1,
+            color_from=color_from,
+        )
+        for tap, wanted in kinds
+    ]
+    *totals, influence = (sum(planes[1:], planes[0]) for planes in zip(*found, strict=True))
     *sums, alpha = (total / (2 * line.pairs) for total in totals)
     if values.accurate_alpha:
         alpha = alpha * (1 + values.area_slope * reach)
     alpha = saturate(values.alpha_gain * alpha, values.softness)
-    used = line.used.to(reach.dtype)
-    return Sums(*(plane * used for plane in (*sums, alpha, influence)))
+    return Sums(*(*sums, alpha, influence))
 
 
 def _pair(
     index: Tensor, count: Tensor, inputs: Inputs, options: _Options
 ) -> tuple[Planes, Tensor, Planes, Tensor, Tensor, Tensor]:
-    step, shift = ((part / inputs["pairs"]) for part in (index + 0.5, inputs["shift"]))
-    times = TapPair(*((side * step + shift).clamp(-1, 1) for side in (1, -1)))
-    taps, weights = zip(*(_tap(t, inputs, options) for t in times), strict=True)
+    taps, weights = zip(*(_tap(t, inputs, options) for t in _times(index, inputs)), strict=True)
     mirrored = mirror(
         weights,
         TapPair(*(tap.depth for tap in taps)),
         TapPair(*(tap.length for tap in taps)),
         options.mirror,
     )
-    taken = (index < inputs["pairs"]).to(step.dtype)
-    parts = [_parts(tap, weighted(taken, w)) for tap, w in zip(taps, mirrored, strict=True)]
+    return _added(index, taps, mirrored, inputs)
+
+
+def _plain_pair(
+    index: Tensor, count: Tensor, inputs: Inputs, options: _Options
+) -> tuple[Planes, Tensor, Planes, Tensor, Tensor, Tensor]:
+    """Return the same of two taps that move as the pixel does, and lie at its depth."""
+    reach, level = inputs["reach"], saturate(inputs["depth_level"], options.softness)
+    planes = _with_alpha(level, 1 - level, reach, inputs, options)
+    weights = tuple(plane.expand_as(reach) for plane in planes)
+    times = _times(index, inputs)
+    taps = [_look(t, inputs, options)[0]._replace(length=reach) for t in times]
+    return _added(index, taps, (weights, weights), inputs)
+
+
+def _times(index: Tensor, inputs: Inputs) -> TapPair:
+    """Return when a pair of taps lies, in units of the reach."""
+    step, shift = ((part / inputs["pairs"]) for part in (index + 0.5, inputs["shift"]))
+    return TapPair(*((side * step + shift).clamp(-1, 1) for side in (1, -1)))
+
+
+def _added(
+    index: Tensor, taps: Sequence[Tap], weights: Sequence[Planes], inputs: Inputs
+) -> tuple[Planes, Tensor, Planes, Tensor, Tensor, Tensor]:
+    """Return what two taps add: nothing where the pixel has fewer pairs."""
+    taken = (index < inputs["pairs"]).to(inputs["reach"].dtype)
+    parts = [_parts(tap, weighted(taken, w)) for tap, w in zip(taps, weights, strict=True)]
     *sums, _ = (ahead + behind for ahead, behind in zip(*parts, strict=True))
     influence = torch.maximum(parts[0][-1], parts[1][-1])
     return tuple(sums[:3]), sums[3], tuple(sums[4:7]), sums[7], sums[8], influence
@@ -203,11 +250,18 @@ def _parts(tap: Tap, weights: Planes) -> Planes:
     return *colors[0], background, *colors[1], foreground, alpha, influence
 
 
+def _look(t: Tensor, inputs: Inputs, options: _Options) -> tuple[Tap, Tensor]:
+    """Return what lies at a time t in [-1, 1], and how far along the line that is, px."""
+    along = (t + options.center) * inputs["reach"]
+    dx, dy = vector(inputs, "direction")
+    x, y = inputs["x"] - along * dx, inputs["y"] - along * dy
+    return sample(inputs, x, y, options.color_lookup), along
+
+
 def _tap(t: Tensor, inputs: Inputs, options: _Options) -> tuple[Tap, Planes]:
     """Return what lies at a time t in [-1, 1]; weights as background, foreground, and its alpha."""
-    reach, (dx, dy) = inputs["reach"], vector(inputs, "direction")
-    along = (t + options.center) * reach
-    tap = sample(inputs, inputs["x"] - along * dx, inputs["y"] - along * dy, options.color_lookup)
+    tap, along = _look(t, inputs, options)
+    dx, dy = vector(inputs, "direction")
     toward = tap.unit_x * dx + tap.unit_y * dy
     distance_s = distance_p = along.abs()
     if options.center:
@@ -228,10 +282,17 @@ def _tap(t: Tensor, inputs: Inputs, options: _Options) -> tuple[Tap, Planes]:
     if options.direction_weights:
         background = background * inputs["own"]
         foreground = foreground * power(toward.abs(), inputs["direction_exponent"])
-    alpha = foreground
-    if options.accurate_alpha:
-        alpha = saturate(foreground / (1 + inputs["area_slope"] * tap.length), options.softness)
-    return tap, (background, foreground, alpha)
+    return tap, _with_alpha(background, foreground, tap.length, inputs, options)
+
+
+def _with_alpha(
+    background: Tensor, foreground: Tensor, size: Tensor, inputs: Inputs, options: _Options
+) -> Planes:
+    """Return both weights, and the alpha of a foreground of some half spread."""
+    if not options.accurate_alpha:
+        return background, foreground, foreground
+    alpha = saturate(foreground / (1 + inputs["area_slope"] * size), options.softness)
+    return background, foreground, alpha
 
 
 def _spread(distance: Tensor, size: Tensor, inputs: Inputs, options: _Options) -> Tensor:
@@ -258,9 +319,10 @@ def compose(frame: Frame, lines: list[Sums], moving: Tensor, values: Values) -> 
         moving: Where the tile moves; elsewhere the color stays, bool, (B, 1, H, W).
         values: The parameters.
     """
-    total = Sums(*(torch.stack(planes).sum(0) for planes in zip(*lines, strict=True)))
-    influence = torch.stack([sums.influence for sums in lines]).amax(0)
-    weight = torch.stack([sums.background + sums.foreground for sums in lines]).amax(0)
+    total = Sums(*(sum(planes[1:], planes[0]) for planes in zip(*lines, strict=True)))
+    influence = functools.reduce(torch.maximum, (sums.influence for sums in lines))
+    weights = (sums.background + sums.foreground for sums in lines)
+    weight = functools.reduce(torch.maximum, weights)
     if values.separate_sums:
         alpha = _together([sums.alpha for sums in lines], values)
         color, alpha, output = _separate(frame, total, alpha, values)

@@ -63,7 +63,7 @@ def post_filter(
     inputs = _inputs(frame, image, values)
     options = _Options(values.post_acceptance == "soft")
     along = [_along(line, inputs, options, values, engine) for line in lines]
-    sums = [torch.stack(planes).sum(0) for planes in zip(*along, strict=True)]
+    sums = [sum(planes[1:], planes[0]) for planes in zip(*along, strict=True)]
     own = values.post_center_weight * inputs["texture"][:, 5:6]
     center = torch.cat((inputs["texture"][:, :3], inputs["texture"][:, 4:5]), 1)
     peak = torch.stack([planes[4] for planes in along]).amax(0).maximum(inputs["alpha"])

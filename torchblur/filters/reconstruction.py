@@ -23,6 +23,7 @@ __all__ = [
     "ColorLookup",
     "ReconstructionConfig",
     "Tap",
+    "color_from",
     "is_one",
     "resolve",
     "sample",
@@ -207,6 +208,17 @@ class ReconstructionConfig(FilterConfig):
             meaning="shifts the noise; give each frame of a sequence its own",
         ),
     ] = 0
+
+
+def color_from(frame: Frame, spread: Spread) -> int:
+    """Return the first channel of a texture that may have a gradient: the color's, or 0.
+
+    Args:
+        frame: As in `texture_of`.
+        spread: Likewise.
+    """
+    others = (*spread, frame.finite_depth())
+    return 0 if any(plane.requires_grad for plane in others) else TEXTURE_COLOR
 
 
 def texture_of(frame: Frame, spread: Spread) -> Tensor:

@@ -11,6 +11,7 @@ from torchblur.filters.base import BlurFilter, Values
 from torchblur.filters.reconstruction import (
     WEIGHT_PARAMETERS,
     ReconstructionConfig,
+    color_from,
     is_one,
     resolve,
     sample,
@@ -222,7 +223,10 @@ def _pass(
     options = _Options(center, is_one(values.cone_exponent), values.softness, values.color_lookup)
     moving = reach > values.early_out
     active = PixelList.where(moving)
-    sums = gather(_tap, options, values.num_samples, inputs, engine, active=active)
+    least = color_from(frame, spread)
+    sums = gather(
+        _tap, options, values.num_samples, inputs, engine, active=active, color_from=least
+    )
     center_weight = values.center_gain / inputs["length_p"]
     return resolve(frame, sums, center_weight, moving)
 

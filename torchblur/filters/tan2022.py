@@ -12,6 +12,7 @@ from torchblur.filters.base import BlurFilter, Values
 from torchblur.filters.reconstruction import (
     WEIGHT_PARAMETERS,
     Tap,
+    color_from,
     is_one,
     resolve,
     sample,
@@ -227,7 +228,13 @@ def _gather(
     moving = length(dominant) > values.early_out
     active = PixelList.where(moving)
     front_color, front, back_color, back = gather(
-        _tap, options, values.num_samples, inputs, engine, active=active
+        _tap,
+        options,
+        values.num_samples,
+        inputs,
+        engine,
+        active=active,
+        color_from=color_from(frame, scaled),
     )
     center = values.center_gain / inputs["length"]
     return _Sums(front_color, front, back_color, back, center, moving)

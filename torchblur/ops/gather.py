@@ -18,7 +18,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from torchblur.ops.pixels import PixelList, takes_all_pixels
+from torchblur.ops.pixels import PixelList, positions, select, takes_all_pixels
 from torchblur.ops.tap_kernels import Lookups
 from torchblur.ops.taps import Engine, Inputs, Lists, Planes, TapFunction, sum_taps
 
@@ -32,6 +32,7 @@ __all__ = [
     "components",
     "gather",
     "gather_lists",
+    "gather_some",
     "lookup",
     "pixel_grid",
     "read",
@@ -61,7 +62,7 @@ def stored_as(storage: Storage) -> Iterator[None]:
         _storage.reset(before)
 
 
-def gather(
+def gather(  # noqa: PLR0913 - a sum has as many parts
     tap: TapFunction,
     options: Hashable,
     num_samples: int,
@@ -70,6 +71,7 @@ def gather(
     *,
     num_maxima: int = 0,
     active: PixelList | None = None,
+    color_from: int = 0,
 ) -> tuple[Tensor, ...]:
     """Return the sums over ``num_samples`` taps of what the tap function returns.
 
@@ -88,6 +90,7 @@ def gather(
             a compiler there is one warning and the eager result.
         num_maxima: So many accumulators, the last ones, are maxima over the taps, not sums.
         active: The pixels that are wanted, all if left out; the others are 0 and cost nothing.
+        color_from: Of the channels of "texture" before this one no gradient is wanted.
 
     Returns:
         The accumulators (B or P, C, H, W), in the tap's order.
@@ -101,7 +104,16 @@ def gather(
     """
     pixels = PixelList.all(inputs["texture"]) if active is None else active
     lists = pixels.lists(inputs)
-    sums = gather_lists(tap, options, num_samples, lists, pixels, engine, num_maxima=num_maxima)
+    sums = gather_lists(
+        tap,
+        options,
+        num_samples,
+        lists,
+        pixels,
+        engine,
+        num_maxima=num_maxima,
+        color_from=color_from,
+    )
     return tuple(pixels.unpack(total) for total in sums)
 
 
@@ -127,7 +139,7 @@ def gather_lists(  # noqa: PLR0913 - what `gather` takes, and the pixels
         pixels: The pixels.
         engine: As in `gather`.
         num_maxima: Likewise.
-        color_from: Of the channels of "texture" before this one no gradient is wanted.
+        color_from: Likewise.
 
     Differentiable: as `gather`.
     """
@@ -135,6 +147,52 @@ def gather_lists(  # noqa: PLR0913 - what `gather` takes, and the pixels
     count = None if takes_all_pixels() else pixels.count  # parts would make a graph very long
     kind = Lists(count, color_from, torch.half if _storage.get() == "half" else None)
     return sum_taps(tap, options, num_samples, inputs, engine, num_maxima=num_maxima, lists=kind)
+
+
+def gather_some(  # noqa: PLR0913 - what `gather_lists` takes, and which pixels
+    tap: TapFunction,
+    options: Hashable,
+    num_samples: int,
+    lists: Mapping[str, Tensor],
+    pixels: PixelList,
+    wanted: Tensor,
+    engine: Engine = "eager",
+    *,
+    num_maxima: int = 0,
+    color_from: int = 0,
+) -> tuple[Tensor, ...]:
+    """Return the same as `gather_lists` for some pixels of the lists, and 0 for the others.
+
+    Args:
+        tap: As in `gather`.
+        options: Likewise.
+        num_samples: Likewise.
+        lists: As in `gather_lists`.
+        pixels: Those of the lists.
+        wanted: Which of them, bool, (P, 1, 1, M); what no set wants costs nothing.
+        engine: As in `gather`.
+        num_maxima: Likewise.
+        color_from: Likewise.
+
+    Differentiable: as `gather`.
+    """
+    chosen = positions(wanted)
+    if chosen is not None:
+        lists = {
+            name: select(plane, chosen)
+            if not name.startswith("texture") and plane.shape[3:] == (pixels.count,)
+            else plane
+            for name, plane in lists.items()
+        }
+    part = pixels if chosen is None else pixels.some(chosen)
+    sums = gather_lists(
+        tap, options, num_samples, lists, part, engine, num_maxima=num_maxima, color_from=color_from
+    )
+    if chosen is not None:
+        sums = tuple(
+            new.new_zeros(*new.shape[:3], pixels.count).index_copy(3, chosen, new) for new in sums
+        )
+    return tuple(torch.where(wanted, plane, 0.0) for plane in sums)
 
 
 def read(

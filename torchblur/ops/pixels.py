@@ -16,9 +16,10 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-__all__ = ["PixelList", "all_pixels", "select", "takes_all_pixels"]
+__all__ = ["PixelList", "all_pixels", "positions", "select", "takes_all_pixels"]
 
 _DENSE = 0.8  # share of wanted pixels from which all are done: packing costs, too
+_ALMOST_ALL = 0.95  # the same of a list: from here on a choice costs more than it saves
 _takes_all: ContextVar[bool] = ContextVar("takes_all", default=False)
 
 
@@ -39,6 +40,18 @@ def all_pixels() -> Iterator[None]:
 def takes_all_pixels() -> bool:
     """Return whether this is inside of `all_pixels`."""
     return _takes_all.get()
+
+
+def positions(wanted: Tensor) -> Tensor | None:
+    """Return which pixels of a list any set wants, int64, (m,); None: all may be taken.
+
+    Args:
+        wanted: bool, (P, 1, 1, M).
+    """
+    if takes_all_pixels():
+        return None
+    some = wanted.any(0).flatten()
+    return None if int(some.sum()) > _ALMOST_ALL * some.shape[0] else some.nonzero()[:, 0]
 
 
 def select(packed: Tensor, chosen: Tensor) -> Tensor:

@@ -99,7 +99,10 @@ def sum_taps(
     signature = tuple((name, t.shape, t.dtype) for name, t in given.items())
     form = _form_of(tap, options, signature, num_maxima)
     # The compiler makes special cases of 0 and 1; so few pixels gain nothing by it.
-    if any(0 in shape for shape in form.shapes) or not (engine == "eager" or compiler_works()):
+    empty = any(0 in shape for shape in form.shapes)
+    if empty and not torch.is_grad_enabled():
+        return form.joined(form.start(floating(given)))
+    if empty or not (engine == "eager" or compiler_works()):
         engine = "eager"
     for candidate in ("compiled", "eager") if engine == "compiled" else ("eager",):
         kernel = kernel_of(tap, options, candidate, form.num_summed)
