@@ -159,6 +159,31 @@ def test_what_is_not_active_is_zero_and_not_computed():
     assert not color[..., 0, :].any()
 
 
+def test_layouts_and_parts_compile_nothing_anew(monkeypatch):
+    # Strides of dimensions of one, offsets and bases of views are all guarded by the compiler.
+    def run(inputs):
+        inputs = dict(inputs)
+        inputs["texture"] = inputs["texture"].clone().requires_grad_()
+        sums = gather(tap, "nearest", 3, inputs, "compiled")
+        sum(plane.square().sum() for plane in sums).backward()
+        return [plane.detach() for plane in sums], inputs["texture"].grad
+
+    inputs = make_inputs(dtype=torch.float32)
+    expected, slope = run(inputs)
+    before = torch._dynamo.utils.counters["stats"]["unique_graphs"]
+    x, y = (inputs[name].expand(1, 1, 5, 9) for name in "xy")
+    views = dict(zip("xy", torch.cat((x, y), 1).split(1, 1), strict=True))
+    assert views["y"].storage_offset()
+    assert views["y"].stride()[0] == 2 * 45
+    monkeypatch.setitem(taps._PART, "compiled", 20)
+    monkeypatch.setattr(taps, "_LEAST_PART", 1)
+    for given in (inputs, inputs | views):
+        sums, grad = run(given)
+        assert all(map(torch.allclose, sums, expected))
+        assert torch.allclose(grad, slope)
+    assert torch._dynamo.utils.counters["stats"]["unique_graphs"] == before
+
+
 def test_one_kernel_serves_all_sizes_batches_and_shares_of_active_pixels():
     inputs = make_inputs(dtype=torch.float32)
     gather(tap, "nearest", 3, inputs, "compiled")
