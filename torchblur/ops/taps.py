@@ -40,7 +40,8 @@ __all__ = ["Engine", "Inputs", "Lists", "Planes", "TapFunction", "sum_taps"]
 
 _PART = {"eager": 1 << 16, "compiled": 1 << 17}
 """Pixels that a CPU takes through all taps at once: what they need should stay in its caches, which
-is more for an eager tap, and the time of each call should not count."""
+is more for an eager tap, and the time of each call should not count. With sets of parameters it is
+their mean number over all planes that counts."""
 _LEAST_PART = 1 << 10  # pixels; with fewer, calls cost more than what they do
 _TAPS_PER_CALL = {"cpu": 1, "cuda": 4}
 """Taps that one kernel adds: on a GPU each pass over the planes serves several. More of them take
@@ -189,16 +190,17 @@ class _Sum:
             for name, tensor in inputs.items()
         }
 
-    def parts(self, like: Tensor) -> list[slice | None]:
+    def parts(self, inputs: Inputs) -> list[slice | None]:
         """Return parts of about equal size; [None] for all pixels at once."""
-        if self.lists.num_pixels is None or like.device.type != "cpu":
+        pixels = self.lists.num_pixels
+        if pixels is None or floating(inputs).device.type != "cpu":
             return [None]
-        sets = max(shape[0] for shape in self.form.shapes)
-        most = _PART[self.kernel.engine]
-        count = min(-(-self.lists.num_pixels * sets // most), self.lists.num_pixels // _LEAST_PART)
+        shapes = [t.shape for t in inputs.values() if self.is_list(t)] + list(self.form.shapes)
+        sets = sum(shape[0] * shape[1] for shape in shapes) / sum(shape[1] for shape in shapes)
+        count = min(math.ceil(pixels * sets / _PART[self.kernel.engine]), pixels // _LEAST_PART)
         if count <= 1:
             return [None]
-        ends = [self.lists.num_pixels * i // count for i in range(count + 1)]
+        ends = [pixels * i // count for i in range(count + 1)]
         return [slice(start, stop) for start, stop in itertools.pairwise(ends)]
 
     def part(self, tensor: Tensor, part: slice | None) -> Tensor:
@@ -257,7 +259,7 @@ class _SumTaps(torch.autograd.Function):
         # Any pixel of a texture may be read by any part: its gradient is one sum over all of them.
         whole = bool(textures) and not in_place
         scattered = {name: totals[name].flatten(1) for name in textures if in_place}
-        for part in [None] if whole else job.parts(floating(named)):
+        for part in [None] if whole else job.parts(named):
             pieces = {name: job.part(tensor, part) for name, tensor in named.items()}
             rest = [job.part(tensor, part) for tensor in (*tensors[len(needed) :], *grads)]
             pulled = _pull(job, pieces, wanted, scattered, rest)
@@ -314,7 +316,7 @@ def _sum(job: _Sum, inputs: Inputs) -> Planes:
     inputs = {name: tensor.detach() for name, tensor in inputs.items()}
     groups, number = _groups(job.num_samples, like)
     whole = job.form.start(like)
-    for part in job.parts(like):
+    for part in job.parts(inputs):
         cut = {name: job.part(tensor, part) for name, tensor in inputs.items()}
         sums = tuple(job.part(plane, part) for plane in whole)
         for indices in groups:
