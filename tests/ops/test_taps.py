@@ -172,20 +172,24 @@ def test_parts_and_groups_of_taps_change_nothing(monkeypatch, sets, with_texture
             assert torch.allclose(ours, theirs, rtol=1e-10, atol=1e-12)
 
 
-def test_no_part_is_larger_than_it_may_be(monkeypatch):
+@pytest.mark.parametrize("sets", [1, 3])
+def test_no_part_is_larger_than_it_may_be(monkeypatch, sets):
     seen = []
 
     def watching(index, count, inputs, options):
-        seen.append(inputs["planes"].shape[-1])
-        return (inputs["planes"] * inputs["decay"],)
+        added = inputs["planes"] * inputs["decay"]
+        kept = [t for t in (*inputs.values(), added) if t.shape[-1] == added.shape[-1]]
+        seen.append((added.shape[-1], sum(t.numel() for t in kept), sum(t.shape[1] for t in kept)))
+        return (added,)
 
     monkeypatch.setattr("torchblur.ops.taps._PART", {"eager": 60})
     monkeypatch.setattr("torchblur.ops.taps._LEAST_PART", 8)
-    sum_taps(watching, None, 2, list_inputs(3, 103), lists=Lists(103))
-    sizes = [size for size in seen if size != 103]  # the first call finds out what it returns
-    assert sizes
-    assert max(sizes) <= 20
-    assert sum(sizes) == 2 * 103
+    sum_taps(watching, None, 2, list_inputs(sets, 103), lists=Lists(103))
+    parts = [part for part in seen if part[0] != 103]  # the first call finds out what it returns
+    assert parts
+    for size, numbers, planes in parts:  # the mean number of sets over all planes counts
+        assert numbers <= 60 * planes * (size + 1) / size
+    assert sum(size for size, _, _ in parts) == 2 * 103
 
 
 @pytest.mark.slow
