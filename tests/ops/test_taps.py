@@ -206,3 +206,18 @@ def test_groups_of_taps_compiled(monkeypatch):
         results.append([color, weight, peak, leaves["planes"].grad, leaves["decay"].grad])
     for ours, theirs in zip(*results, strict=True):
         assert torch.allclose(ours, theirs, rtol=1e-4, atol=1e-5)
+
+
+def test_no_pixels_need_no_taps_and_have_a_graph():
+    calls = []
+
+    def counting(index, count, inputs, options):
+        calls.append(index)
+        return list_tap(index, count, inputs, options)
+
+    leaves = {k: v.clone().requires_grad_() for k, v in list_inputs(2, 0).items()}
+    sums = sum_taps(counting, None, 10, leaves, "compiled", num_maxima=1, lists=Lists(0))
+    assert [plane.shape for plane in sums] == [(2, 1, 1, 0)] * 3
+    sum(plane.sum() for plane in sums).backward()
+    assert len(calls) == 1  # the one that finds out what it returns
+    assert all(leaf.grad is not None and not leaf.grad.any() for leaf in leaves.values())

@@ -100,10 +100,9 @@ def sum_taps(
     signature = tuple((name, t.shape, t.dtype) for name, t in given.items())
     form = _form_of(tap, options, signature, num_maxima)
     # The compiler makes special cases of 0 and 1; so few pixels gain nothing by it.
-    empty = any(0 in shape for shape in form.shapes)
-    if empty and not torch.is_grad_enabled():
-        return form.joined(form.start(floating(given)))
-    if empty or not (engine == "eager" or compiler_works()):
+    if any(0 in shape for shape in form.shapes):
+        engine, num_samples = "eager", 0  # nothing to add, but a graph
+    elif engine == "compiled" and not compiler_works():
         engine = "eager"
     for candidate in ("compiled", "eager") if engine == "compiled" else ("eager",):
         kernel = kernel_of(tap, options, candidate, form.num_summed)
