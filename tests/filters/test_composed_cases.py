@@ -142,6 +142,7 @@ def test_a_config_is_taken_over_with_changes():
         ("sousa2013", {}, "guertin2014, jimenez2014, mcguire2012, notes2025, got `sousa2013`"),
         ("guertin2014", {"sample_assignment": "variance"}, "`sample_assignment`.*'variance'"),
         ("notes2025", {"resolution": "half"}, "`resolution` must be 'full'.*'half'"),
+        ("notes2025", {"tile_classes": True}, "`tile_classes` of notes2025 must be off"),
         ("guertin2014", {"kapa": 3}, "`kapa`.*did you mean `kappa`"),
         ("guertin2014", {"num_samples": 1, "phi": 90.0}, r"`jitter` must lie in .*got 171"),
     ],

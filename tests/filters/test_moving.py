@@ -194,3 +194,29 @@ def test_the_fast_class_averages_plainly():
         for side in (1, -1)
     )
     assert torch.allclose(layers["color"], expected / 8, atol=1e-6)
+
+
+@pytest.mark.parametrize("name", [n for n in FILTERS if n != "line"] + ["torchblur"])
+@pytest.mark.parametrize("wanted", ["color", "velocity", "depth", "shutter"])
+def test_texture_gradients_are_of_the_color_alone_if_nothing_else_wants_one(
+    monkeypatch, name, wanted
+):
+    # A compiled backward leaves out the channels before `color_from`; an eager one has them all.
+    first = []
+    original = gather_module.sum_taps
+
+    def noting(tap, *args, lists, **kwargs):
+        first.append(lists.color_from)
+        return original(tap, *args, lists=lists, **kwargs)
+
+    monkeypatch.setattr(gather_module, "sum_taps", noting)
+    frame, given = random_frame(24, 32, speed=30.0), {}
+    leaf = torch.tensor(0.5) if wanted == "shutter" else getattr(frame, wanted).clone()
+    leaf.requires_grad_()
+    if wanted == "shutter":
+        given["shutter"] = leaf
+    else:
+        frame = dataclasses.replace(frame, **{wanted: leaf})
+    without_notices(make(name))(frame, **given).sum().backward()
+    assert max(first) == (4 if wanted == "color" else 0)
+    assert leaf.grad is not None

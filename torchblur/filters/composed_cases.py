@@ -143,6 +143,8 @@ def _notes2025(config: Notes2025Config) -> dict[str, Any]:
         raise ConfigError(
             f"`resolution` must be 'full' for the composed filter, got {config.resolution!r}"
         )
+    if config.tile_classes:  # the composed filter's ask for other conditions
+        raise ConfigError("`tile_classes` of notes2025 must be off for the composed filter")
     same = (
         "jitter",
         "tile_jitter",
