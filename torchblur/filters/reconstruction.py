@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Annotated, Literal, NamedTuple
 
 import torch
@@ -280,16 +281,18 @@ def sample(inputs: Inputs, x: Tensor, y: Tensor, color_lookup: ColorLookup) -> T
     Returns:
         The tap; what shows the revealed layer has its color.
     """
-    ux, uy, size, depth, *near = read(inputs, x, y)
-    if color_lookup == "cubic":
-        near = list(read_cubic(inputs, x, y, slice(TEXTURE_COLOR, None)))
-    elif color_lookup != "nearest":
-        fine = read(inputs, x, y, "bilinear", slice(TEXTURE_COLOR, None))
-        if color_lookup == "opportunistic":
-            linear = inputs["linear"] > 0
-            fine = tuple(torch.where(linear, f, n) for f, n in zip(fine, near, strict=True))
-        near = list(fine)
-    tap = Tap(tuple(near[:3]), ux, uy, size, depth, near[3] if near[3:] else None)
+    color: Sequence[Tensor]
+    if color_lookup == "nearest":
+        ux, uy, size, depth, *color = read(inputs, x, y)
+    else:
+        ux, uy, size, depth = read(inputs, x, y, channels=slice(0, TEXTURE_COLOR))
+        channels = slice(TEXTURE_COLOR, None)
+        if color_lookup == "cubic":
+            color = read_cubic(inputs, x, y, channels)
+        else:
+            linear = inputs["linear"] > 0 if color_lookup == "opportunistic" else None
+            color = read(inputs, x, y, "bilinear", channels, linear=linear)
+    tap = Tap(tuple(color[:3]), ux, uy, size, depth, color[3] if color[3:] else None)
     if "revealed_r" not in inputs:
         return tap
     share = background_share(inputs, x, y, depth)

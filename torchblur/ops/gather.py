@@ -202,6 +202,8 @@ def read(
     mode: Lookup = "nearest",
     channels: slice = slice(None),
     name: str = "texture",
+    *,
+    linear: Tensor | None = None,
 ) -> Planes:
     """Return a tap's view of the texture at positions in pixel indices; for tap functions.
 
@@ -212,6 +214,8 @@ def read(
         mode: "nearest" (ties to even) or "bilinear".
         channels: Those of the texture that are wanted.
         name: Which texture.
+        linear: Where a bilinear lookup is one, bool, (P, 1, 1, M); elsewhere it is nearest. None:
+            everywhere.
 
     Returns:
         One plane (P, 1, 1, M) per channel.
@@ -228,7 +232,13 @@ def read(
     compiling = torch.compiler.is_dynamo_compiling() or isinstance(texture, Lookups)
     as_is = not compiling and texture.dtype == x.dtype
     if as_is and texture.shape[1] <= _MOST_ROWS:
-        return _sampled(texture, x + first_column, y + first_row)
+        fine = _sampled(texture, x + first_column, y + first_row)
+        if linear is None:
+            return fine
+        near = _split(_at(texture, x.round() + first_column, y.round() + first_row))
+        return tuple(torch.where(linear, f, n) for f, n in zip(fine, near, strict=True))
+    if linear is not None:  # at a pixel's center a bilinear lookup is that pixel
+        x, y = torch.where(linear, x, x.round()), torch.where(linear, y, y.round())
     left, top = x.detach().floor(), y.detach().floor()
     right = torch.minimum(left + 1, inputs["width"] - 1)
     bottom = torch.minimum(top + 1, inputs["height"] - 1)

@@ -8,6 +8,7 @@ it; on a CPU its threads would need atomic additions, which cost ten times what 
 from __future__ import annotations
 
 import functools
+import itertools
 from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple
@@ -32,6 +33,7 @@ __all__ = [
     "floating",
     "kernel_of",
     "reads_of",
+    "room_for",
     "scatter",
 ]
 
@@ -43,12 +45,13 @@ Added = tuple[Tensor | Planes, ...]
 TapFunction = Callable[[Tensor, Tensor, Inputs, Any], Added]
 """``tap(index, count, inputs, options)``: index and count are 0-d float tensors."""
 
-Moved = tuple[tuple[int, Tensor, Planes], ...]
-"""Of each lookup in a texture: its first channel, where, (P * M,), and each channel's gradient."""
+Moved = tuple[tuple[Tensor, Planes], ...]
+"""Of each lookup in a texture: where, and each channel's gradient, (P * M,) each."""
 Reads = tuple[tuple[tuple[int, int, int], ...], ...]
 """Of each texture, each lookup's first channel, number of channels, and parameter sets."""
 
 
+_OPTIONS = {"max_fusion_size": 512}  # of the compiler: steps of a loop, for which 64 are too few
 _APART = ("cpu",)  # devices on which gradients of textures are added outside of the kernel
 
 
@@ -147,14 +150,25 @@ class Part(NamedTuple):
     """What a backward pass works on: some pixels, or all."""
 
     wanted: Inputs
-    """Inputs whose gradient is returned."""
+    """Inputs whose gradient is wanted."""
+    parameters: Inputs
+    """Others of which it is wanted, as a plane: the sum over its pixels is theirs.
+
+    Among all that a tap does, a sum over pixels would end the loop: the compiler writes what lies
+    before it to memory, and reads it in the next."""
     others: Inputs
+    totals: Inputs
+    """Gradients of `wanted` and `parameters`, which are added to in place."""
     grads: Planes
     """Of each accumulator."""
     peaks: Planes
     """The accumulators that are maxima."""
+    taken: Planes
+    """Where each of them has been given its gradient, bool, kept up in place."""
     scattered: Inputs
     """Gradients of textures, (C, rows * W), which are added to in place."""
+    moved: tuple[Moved, ...]
+    """Of each texture, what a tap leaves to `scatter`, from `room_for`."""
 
 
 @dataclass(frozen=True)
@@ -165,17 +179,16 @@ class Kernel:
         tap: The tap function.
         options: Its switches.
         engine: How it runs. Only a compiled backward adds to `Part.scattered`.
-        add: ``add(sums, indices, count, inputs)``: the sums with these taps added.
-        pull: ``pull(totals, taken, indices, count, part, reads, color_from)``: gradients with those
-            of these taps added, where each maximum has been given its gradient, and what each tap
-            leaves to `scatter`, texture by texture.
+        add: ``add(sums, indices, count, inputs)`` adds these taps to the sums, in place.
+        pull: ``pull(indices, count, part, reads, color_from)`` adds the gradients of these taps to
+            the part's, in place. Where it leaves some to `scatter`, there must be one tap.
     """
 
     tap: TapFunction
     options: Hashable
     engine: Engine
-    add: Callable[[Planes, Planes, Tensor, Inputs], Planes]
-    pull: Callable[..., tuple[Inputs, Planes, list[list[Moved]]]]
+    add: Callable[[Planes, Planes, Tensor, Inputs], None]
+    pull: Callable[[Planes, Tensor, Part, Reads, int], None]
 
 
 @functools.lru_cache(maxsize=128)
@@ -189,56 +202,47 @@ def kernel_of(tap: TapFunction, options: Hashable, engine: Engine, num_summed: i
         num_summed: Number of planes that are sums; the rest are maxima.
     """
 
-    def add(sums: Planes, indices: Planes, count: Tensor, inputs: Inputs) -> Planes:
+    def add(sums: Planes, indices: Planes, count: Tensor, inputs: Inputs) -> None:
         for index in indices:
             pairs = tuple(zip(sums, flat(tap(index, count, inputs, options)), strict=True))
-            total = tuple(s + a for s, a in pairs[:num_summed])
-            sums = total + tuple(torch.maximum(s, a) for s, a in pairs[num_summed:])
-        return sums
+            for total, added in pairs[:num_summed]:
+                total += added
+            for peak, value in pairs[num_summed:]:
+                peak.copy_(torch.maximum(peak, value))
 
-    def pull(
-        totals: Inputs,
-        taken: Planes,
-        indices: Planes,
-        count: Tensor,
-        part: Part,
-        reads: Reads,
-        color_from: int,
-    ) -> tuple[Inputs, Planes, list[list[Moved]]]:
-        left: list[list[Moved]] = []
+    def pull(indices: Planes, count: Tensor, part: Part, reads: Reads, color_from: int) -> None:
         for index in indices:
 
             def one_tap(inputs: dict[str, Any], index: Tensor = index) -> Planes:
                 return flat(tap(index, count, inputs, options))
 
-            parts, taken, moved = _pull_one(one_tap, taken, part, reads, num_summed, color_from)
-            totals = {name: totals[name] + parts[name] for name in totals}
-            if part.grads[0].device.type in _APART:
-                left.append(moved)
+            moved = _pull_one(one_tap, part, reads, num_summed, color_from)
+            if part.moved:
+                _keep(part.moved, moved)
             else:
-                for name, lookups in zip(part.scattered, moved, strict=True):
-                    _scatter_in_kernel(part.scattered[name], part.others[name], lookups)
-        return totals, taken, left
+                _scatter_in_kernel(part, reads, moved)
 
     if engine == "compiled":
-        add, pull = compile_alone(add, dynamic=True), compile_alone(pull, dynamic=True)
+        add, pull = (compile_alone(f, dynamic=True, options=_OPTIONS) for f in (add, pull))
     return Kernel(tap, options, engine, add, pull)
 
 
 def _pull_one(
     tap: Callable[[dict[str, Any]], Planes],
-    taken: Planes,
     part: Part,
     reads: Reads,
     num_summed: int,
     color_from: int,
-) -> tuple[Inputs, Planes, list[Moved]]:
-    """Return the gradients of one tap, where maxima have been given theirs, and of what it read."""
+) -> list[Moved]:
+    """Add the gradients of one tap, and return those of what it read in textures."""
     grads = part.grads
 
-    def probed(leaves: Inputs, probes: list[list[Planes]]) -> tuple[Planes, list[list[Tensor]]]:
+    def probed(
+        leaves: Inputs, zeros: Inputs, probes: list[list[Planes]]
+    ) -> tuple[Planes, list[list[Tensor]]]:
         notes: list[list[tuple[int, int, Tensor]]] = [[] for _ in probes]
         inputs: dict[str, Any] = part.others | leaves
+        inputs |= {name: part.parameters[name] + zero for name, zero in zeros.items()}
         for name, probe, read in zip(part.scattered, probes, notes, strict=True):
             inputs[name] = _lookups(name, inputs[name], probe, read, color_from)
         added = tuple(a.expand_as(g) for a, g in zip(tap(inputs), grads, strict=True))
@@ -253,21 +257,25 @@ def _pull_one(
         ]
         for each in reads
     ]
-    values, vjp, places = torch.func.vjp(probed, part.wanted, probes, has_aux=True)  # type: ignore[misc]
+    zeros = {name: torch.zeros_like(part.totals[name]) for name in part.parameters}
+    values, vjp, places = torch.func.vjp(probed, part.wanted, zeros, probes, has_aux=True)  # type: ignore[misc]
     first = []
-    for value, peak, before in zip(values[num_summed:], part.peaks, taken, strict=True):
+    for value, peak, before in zip(values[num_summed:], part.peaks, part.taken, strict=True):
         # Recomputed by another graph, a value may differ in its last bits.
         first.append((value >= peak - 1e-6 * peak.abs()) & ~before)
     due = [g * f for g, f in zip(grads[num_summed:], first, strict=True)]
-    parts, moved = vjp(grads[:num_summed] + tuple(due))
-    lookups = [
+    of_wanted, of_parameters, moved = vjp(grads[:num_summed] + tuple(due))
+    for name, gradient in (of_wanted | of_parameters).items():
+        part.totals[name].add_(gradient)
+    for before, now in zip(part.taken, first, strict=True):
+        before.logical_or_(now)
+    return [
         tuple(
-            (start, place.flatten().long(), tuple(gradient.flatten() for gradient in gradients))
-            for (start, _, _), place, gradients in zip(*texture, strict=True)
+            (place.flatten().long(), tuple(plane.flatten() for plane in planes))
+            for place, planes in zip(*texture, strict=True)
         )
-        for texture in zip(reads, places, moved, strict=True)
+        for texture in zip(places, moved, strict=True)
     ]
-    return parts, tuple(t | f for t, f in zip(taken, first, strict=True)), lookups
 
 
 def _lookups(
@@ -280,20 +288,54 @@ def _lookups(
     return Lookups(texture, probes, read, color_from if name == "texture" else 0)
 
 
-def scatter(total: Tensor, moved: Moved) -> None:
-    """Add the gradients of what was read to that of a texture, in place.
+def room_for(reads: Reads, like: Tensor) -> tuple[Moved, ...]:
+    """Return room for what one tap leaves to `scatter`, or nothing where its kernel leaves nothing.
+
+    Every tap overwrites it: memory that is new to each of them would not be in the caches.
 
     Args:
-        total: Gradient of the texture, (C, rows * W).
-        moved: What lookups leave.
+        reads: How the tap reads textures.
+        like: An accumulator's gradient, (P, 1, 1, M).
     """
-    for start, place, gradients in moved:
-        for channel, gradient in zip(total[start:], gradients, strict=False):
-            channel.scatter_add_(0, place, gradient.to(total.dtype))
+    if like.device.type not in _APART:
+        return ()
+    pixels = like.shape[-1]
+    return tuple(
+        tuple(
+            (
+                like.new_empty(sets * pixels, dtype=torch.long),
+                tuple(like.new_empty(sets * pixels) for _ in range(channels)),
+            )
+            for _, channels, sets in texture
+        )
+        for texture in reads
+    )
 
 
-def _scatter_in_kernel(total: Tensor, texture: Tensor, moved: Moved) -> None:
-    size = texture.shape[1] * texture.shape[2]
-    for start, place, gradients in moved:
-        for channel, gradient in enumerate(gradients, start):
-            total.view(-1).index_put_((place + channel * size,), gradient, accumulate=True)
+def _keep(room: tuple[Moved, ...], moved: list[Moved]) -> None:
+    for old, new in zip(itertools.chain(*room), itertools.chain(*moved), strict=True):
+        old[0].copy_(new[0])
+        for plane, gradient in zip(old[1], new[1], strict=True):
+            plane.copy_(gradient)
+
+
+def scatter(part: Part, reads: Reads) -> None:
+    """Add the gradients of what a tap read to those of the textures, in place.
+
+    Args:
+        part: Where the tap has left them.
+        reads: How it reads textures.
+    """
+    for total, lookups, moved in zip(part.scattered.values(), reads, part.moved, strict=False):
+        for (start, _, _), (place, gradients) in zip(lookups, moved, strict=True):
+            for channel, gradient in enumerate(gradients, start):
+                total[channel].scatter_add_(0, place, gradient.to(total.dtype))
+
+
+def _scatter_in_kernel(part: Part, reads: Reads, moved: list[Moved]) -> None:
+    for name, lookups, left in zip(part.scattered, reads, moved, strict=True):
+        total, (_, height, width) = part.scattered[name], part.others[name].shape
+        for (start, _, _), (place, gradients) in zip(lookups, left, strict=True):
+            for channel, gradient in enumerate(gradients, start):
+                places = place + channel * height * width
+                total.view(-1).index_put_((places,), gradient, accumulate=True)

@@ -33,12 +33,13 @@ from torchblur.ops.tap_kernels import (
     floating,
     kernel_of,
     reads_of,
+    room_for,
     scatter,
 )
 
 __all__ = ["Engine", "Inputs", "Lists", "Planes", "TapFunction", "sum_taps"]
 
-_PART = {"eager": 1 << 16, "compiled": 1 << 17}
+_PART = {"eager": 1 << 16, "compiled": 1 << 18}
 """Pixels that a CPU takes through all taps at once: what they need should stay in its caches, which
 is more for an eager tap, and the time of each call should not count. With sets of parameters it is
 their mean number over all planes that counts."""
@@ -210,7 +211,7 @@ class _Sum:
         """
         if not self.is_list(tensor):
             return tensor
-        piece = tensor if part is None else tensor[..., part]
+        piece = tensor if part is None else tensor[..., part].clone()
         flat = piece.reshape(-1)
         return (flat.clone() if flat.storage_offset() else flat).view(piece.shape).data
 
@@ -289,24 +290,37 @@ def _pull(
     # Views of other tensors would be another case to the compiler for each shape of those.
     grads = tuple(g.clone(memory_format=torch.contiguous_format) for g in rest[num_maxima:])
     leaves = {name: named[name] for name in wanted if name not in scattered}
-    others = {name: tensor for name, tensor in named.items() if name not in leaves}
-    part = Part(leaves, others, grads, peaks, scattered)
+    # Eager taps take sums over pixels as they come; without lists there is nothing to sum over.
+    as_planes = job.kernel.engine == "compiled" and job.lists.num_pixels is not None
+    parameters = {n: t for n, t in leaves.items() if as_planes and not job.is_list(t)}
+    lists = {name: tensor for name, tensor in leaves.items() if name not in parameters}
     reads: Reads = ()
     if scattered:
         signature = tuple((name, t.shape, t.dtype) for name, t in named.items())
         kernel, names = job.kernel, tuple(scattered)
         reads = reads_of(kernel.tap, kernel.options, signature, names, job.lists.color_from)
-    totals = {name: torch.zeros_like(tensor) for name, tensor in leaves.items()}
-    taken = tuple(torch.zeros_like(peak, dtype=torch.bool) for peak in peaks)
+    part = Part(
+        wanted=lists,
+        parameters=parameters,
+        others={name: tensor for name, tensor in named.items() if name not in leaves},
+        totals={name: torch.zeros_like(tensor) for name, tensor in lists.items()}
+        | {name: _plane_for(tensor, grads) for name, tensor in parameters.items()},
+        grads=grads,
+        peaks=peaks,
+        taken=tuple(torch.zeros_like(peak, dtype=torch.bool) for peak in peaks),
+        scattered=scattered,
+        moved=room_for(reads, grads[0]),
+    )
     groups, number = _groups(job.num_samples, floating(named))
     for indices in groups:
-        totals, taken, left = job.kernel.pull(
-            totals, taken, indices, number, part, reads, job.lists.color_from
-        )
-        for lookups in left:
-            for total, moved in zip(scattered.values(), lookups, strict=True):
-                scatter(total, moved)
-    return totals
+        job.kernel.pull(indices, number, part, reads, job.lists.color_from)
+        scatter(part, reads)
+    return {name: total.sum_to_size(leaves[name].shape) for name, total in part.totals.items()}
+
+
+def _plane_for(parameter: Tensor, grads: Planes) -> Tensor:
+    shapes = (plane.shape for plane in grads)
+    return parameter.new_zeros(torch.broadcast_shapes(parameter.shape, *shapes))
 
 
 @torch.no_grad()
@@ -319,7 +333,7 @@ def _sum(job: _Sum, inputs: Inputs) -> Planes:
         cut = {name: job.part(tensor, part) for name, tensor in inputs.items()}
         sums = tuple(job.part(plane, part) for plane in whole)
         for indices in groups:
-            sums = job.kernel.add(sums, indices, number, cut)
+            job.kernel.add(sums, indices, number, cut)
         whole = tuple(job.put(*pair, part) for pair in zip(whole, sums, strict=True))
     return whole
 
