@@ -2,10 +2,12 @@ import dataclasses
 
 import pytest
 import torch
+from torch._inductor.utils import run_and_get_code
 
 from torchblur.filters import get_filter
 from torchblur.frame import Frame
 from torchblur.ops import gather as gather_module
+from torchblur.ops.tap_kernels import kernel_of
 from torchblur.testing.frames import random_frame
 
 FILTERS = ("guertin2014", "jimenez2014", "line", "mcguire2012", "notes2025", "sousa2013", "tan2022")
@@ -220,3 +222,18 @@ def test_texture_gradients_are_of_the_color_alone_if_nothing_else_wants_one(
     without_notices(make(name))(frame, **given).sum().backward()
     assert max(first) == (4 if wanted == "color" else 0)
     assert leaf.grad is not None
+
+
+@pytest.mark.parametrize("name", ["guertin2014", "mcguire2012", "sousa2013"])
+@pytest.mark.parametrize("color", [True, False])
+def test_each_compiled_pass_is_one_loop_over_the_pixels(name, color):
+    # What lies between two loops goes through memory, which takes longer than what they compute.
+    frame = random_frame(24, 32, speed=30.0)
+    if color:
+        frame = dataclasses.replace(frame, color=frame.color.clone().requires_grad_())
+    kernel_of.cache_clear()
+    torch._dynamo.reset()
+    blur = make(name, engine="compiled", shutter=0.5)
+    _, codes = run_and_get_code(lambda: blur(frame).sum().backward())
+    assert len(codes) >= 2
+    assert {code.count("for(int64_t x0=") for code in codes} == {1}

@@ -104,6 +104,53 @@ def test_compiled_gradient_of_a_texture_in_any_layout(monkeypatch, strided, apar
     assert any(left) == apart
 
 
+def partly_linear_tap(index, count, inputs, options):
+    x, y = inputs["x"] + 0.4 * index, inputs["y"] + 0.3 * index
+    return read(inputs, x, y, "bilinear", linear=inputs["linear"] > 0), 0 * x
+
+
+@pytest.mark.parametrize("engine", ["eager", "compiled"])
+def test_a_lookup_is_bilinear_only_where_it_is_asked_for(engine):
+    inputs = make_inputs(dtype=torch.float32)
+    inputs["linear"] = torch.arange(45.0).view(1, 1, 5, 9) % 2
+    linear = inputs["linear"] > 0
+    ours, theirs = (inputs["texture"].clone().requires_grad_() for _ in range(2))
+    color, _ = gather(partly_linear_tap, None, 3, inputs | {"texture": ours}, engine)
+    places = [(inputs["x"] + 0.4 * i, inputs["y"] + 0.3 * i) for i in range(3)]
+    fine, near = (
+        sum(lookup(theirs, *place, m) for place in places) for m in ("bilinear", "nearest")
+    )
+    expected = torch.where(linear, fine, near)
+    assert torch.equal(torch.where(linear, 0, color), torch.where(linear, 0, expected))
+    assert torch.allclose(color, expected, atol=1e-5)
+    for image in (color, expected):
+        image.square().sum().backward()
+    assert torch.allclose(ours.grad, theirs.grad, rtol=1e-4, atol=1e-5)
+
+
+def parameters_tap(index, count, inputs, options):
+    x = inputs["x"] + index
+    weight = inputs["gain"] * torch.exp(-inputs["decay"] * index / count)
+    return weighted(weight, read(inputs, x, inputs["y"])), weight * inputs["list"] + 0 * x
+
+
+@pytest.mark.parametrize(("sets", "unused"), [(1, 1), (3, 1), (3, 3), (1, 3)])
+def test_compiled_gradients_of_parameters_of_any_shape(sets, unused):
+    results = []
+    for engine in ("eager", "compiled"):
+        inputs = make_inputs(sets=sets, dtype=torch.float32)
+        inputs |= {"gain": torch.tensor(0.7), "unused": torch.ones(unused, 1, 1, 1)}
+        inputs["list"] = torch.linspace(0, 1, 45).view(1, 1, 5, 9)
+        leaves = {name: tensor.requires_grad_() for name, tensor in inputs.items()}
+        color, weight = gather(parameters_tap, None, 4, leaves, engine)
+        (color.square().sum() + (weight * color).sum()).backward()
+        results.append([leaves[name].grad for name in ("gain", "decay", "list", "unused")])
+    for eager, compiled in zip(*results, strict=True):
+        assert (eager is None) == (compiled is None)
+        assert eager is None or torch.allclose(compiled, eager, rtol=1e-5)
+    assert results[0][0] != 0
+
+
 class TestHalfStorage:
     @pytest.mark.parametrize("mode", ["nearest", "bilinear"])
     @pytest.mark.parametrize("engine", ["eager", "compiled"])

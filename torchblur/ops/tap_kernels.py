@@ -51,7 +51,8 @@ Reads = tuple[tuple[tuple[int, int, int], ...], ...]
 """Of each texture, each lookup's first channel, number of channels, and parameter sets."""
 
 
-_OPTIONS = {"max_fusion_size": 512}  # of the compiler: steps of a loop, for which 64 are too few
+_OPTIONS = {"cpu": {"max_fusion_size": 512}}
+"""Of the compiler: steps of one loop, of which a tap's gradient has more than the usual 64."""
 _APART = ("cpu",)  # devices on which gradients of textures are added outside of the kernel
 
 
@@ -192,7 +193,9 @@ class Kernel:
 
 
 @functools.lru_cache(maxsize=128)
-def kernel_of(tap: TapFunction, options: Hashable, engine: Engine, num_summed: int) -> Kernel:
+def kernel_of(
+    tap: TapFunction, options: Hashable, engine: Engine, num_summed: int, device: str
+) -> Kernel:
     """Return the functions of some taps; one object for each structure.
 
     Args:
@@ -200,6 +203,7 @@ def kernel_of(tap: TapFunction, options: Hashable, engine: Engine, num_summed: i
         options: Its switches.
         engine: "eager" or "compiled".
         num_summed: Number of planes that are sums; the rest are maxima.
+        device: Type of the inputs' device.
     """
 
     def add(sums: Planes, indices: Planes, count: Tensor, inputs: Inputs) -> None:
@@ -223,7 +227,8 @@ def kernel_of(tap: TapFunction, options: Hashable, engine: Engine, num_summed: i
                 _scatter_in_kernel(part, reads, moved)
 
     if engine == "compiled":
-        add, pull = (compile_alone(f, dynamic=True, options=_OPTIONS) for f in (add, pull))
+        own = _OPTIONS.get(device)
+        add, pull = (compile_alone(f, dynamic=True, options=own) for f in (add, pull))
     return Kernel(tap, options, engine, add, pull)
 
 

@@ -39,7 +39,7 @@ from torchblur.ops.tap_kernels import (
 
 __all__ = ["Engine", "Inputs", "Lists", "Planes", "TapFunction", "sum_taps"]
 
-_PART = {"eager": 1 << 16, "compiled": 1 << 18}
+_PART = {"eager": 1 << 16, "compiled": 300_000}
 """Pixels that a CPU takes through all taps at once: what they need should stay in its caches, which
 is more for an eager tap, and the time of each call should not count. With sets of parameters it is
 their mean number over all planes that counts."""
@@ -106,7 +106,7 @@ def sum_taps(
     elif engine == "compiled" and not compiler_works():
         engine = "eager"
     for candidate in ("compiled", "eager") if engine == "compiled" else ("eager",):
-        kernel = kernel_of(tap, options, candidate, form.num_summed)
+        kernel = kernel_of(tap, options, candidate, form.num_summed, floating(given).device.type)
         try:
             return form.joined(_run(_Sum(kernel, num_samples, form, lists or Lists(None)), given))
         except compiler_errors() as error:
