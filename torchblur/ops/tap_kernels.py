@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import functools
 import itertools
-from collections.abc import Callable, Hashable, Sequence
+from collections.abc import Callable, Hashable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple
 
@@ -28,6 +28,7 @@ __all__ = [
     "Part",
     "Planes",
     "Reads",
+    "Room",
     "TapFunction",
     "flat",
     "floating",
@@ -169,7 +170,7 @@ class Part(NamedTuple):
     scattered: Inputs
     """Gradients of textures, (C, rows * W), which are added to in place."""
     moved: tuple[Moved, ...]
-    """Of each texture, what a tap leaves to `scatter`, from `room_for`."""
+    """Of each texture, what a tap leaves to `scatter`: `Room.planes`."""
 
 
 @dataclass(frozen=True)
@@ -293,28 +294,58 @@ def _lookups(
     return Lookups(texture, probes, read, color_from if name == "texture" else 0)
 
 
-def room_for(reads: Reads, like: Tensor) -> tuple[Moved, ...]:
-    """Return room for what one tap leaves to `scatter`, or nothing where its kernel leaves nothing.
+class Room(NamedTuple):
+    """Memory for what one tap leaves to `scatter`, seen in two ways; the next tap overwrites it.
 
-    Every tap overwrites it: memory that is new to each of them would not be in the caches.
+    Memory that is new to each tap would not be in the caches.
+    """
+
+    planes: tuple[Moved, ...]
+    """As the kernel writes it. Each plane has a storage of its own: the compiler makes another loop
+    of what goes into a part of a tensor."""
+    joined: tuple[tuple[str, int, Tensor, Tensor], ...]
+    """Texture, first channel, where, (L,), and gradients, (C, L), of lookups that read alike."""
+
+
+def room_for(names: Iterable[str], reads: Reads, like: Tensor) -> Room:
+    """Return room for what a tap leaves; none where its kernel leaves nothing.
 
     Args:
-        reads: How the tap reads textures.
+        names: The textures.
+        reads: How the tap reads them.
         like: An accumulator's gradient, (P, 1, 1, M).
     """
     if like.device.type not in _APART:
-        return ()
-    pixels = like.shape[-1]
-    return tuple(
-        tuple(
-            (
-                like.new_empty(sets * pixels, dtype=torch.long),
-                tuple(like.new_empty(sets * pixels) for _ in range(channels)),
-            )
-            for _, channels, sets in texture
-        )
-        for texture in reads
-    )
+        return Room((), ())
+    planes: list[Moved] = []
+    joined: list[tuple[str, int, Tensor, Tensor]] = []
+    for name, lookups in zip(names, reads, strict=True):
+        moved: dict[int, tuple[Tensor, Planes]] = {}
+        for start, count in dict.fromkeys(lookup[:2] for lookup in lookups):
+            alike = [i for i, lookup in enumerate(lookups) if lookup[:2] == (start, count)]
+            sizes = [lookups[i][2] * like.shape[-1] for i in alike]
+            where, (places,) = _in_pieces(1, sizes, torch.long)
+            gradients, rows = _in_pieces(count, sizes, like.dtype)
+            for i, place, *channels in zip(alike, places, *rows, strict=True):
+                moved[i] = place, tuple(channels)
+            joined.append((name, start, where[0], gradients))
+        planes.append(tuple(moved[i] for i in range(len(lookups))))
+    return Room(tuple(planes), tuple(joined))
+
+
+def _in_pieces(
+    rows: int, sizes: list[int], dtype: torch.dtype
+) -> tuple[Tensor, list[list[Tensor]]]:
+    """Return rows, and the pieces of each: the same memory, but storages of their own."""
+    # Large pages, which torch asks for, are for large pieces only.
+    memory = torch.empty(rows * sum(sizes) * dtype.itemsize, dtype=torch.uint8).numpy()
+    ends = itertools.accumulate(sizes * rows, initial=0)
+    pieces = [
+        torch.frombuffer(memory, dtype=dtype, count=size, offset=end * dtype.itemsize)
+        for end, size in zip(ends, sizes * rows, strict=False)
+    ]
+    whole = torch.frombuffer(memory, dtype=dtype).view(rows, -1)
+    return whole, [pieces[i : i + len(sizes)] for i in range(0, len(pieces), len(sizes))]
 
 
 def _keep(room: tuple[Moved, ...], moved: list[Moved]) -> None:
@@ -324,17 +355,16 @@ def _keep(room: tuple[Moved, ...], moved: list[Moved]) -> None:
             plane.copy_(gradient)
 
 
-def scatter(part: Part, reads: Reads) -> None:
+def scatter(totals: Inputs, room: Room) -> None:
     """Add the gradients of what a tap read to those of the textures, in place.
 
     Args:
-        part: Where the tap has left them.
-        reads: How it reads textures.
+        totals: Gradients of the textures, (C, rows * W).
+        room: Where the tap has left them.
     """
-    for total, lookups, moved in zip(part.scattered.values(), reads, part.moved, strict=False):
-        for (start, _, _), (place, gradients) in zip(lookups, moved, strict=True):
-            for channel, gradient in enumerate(gradients, start):
-                total[channel].scatter_add_(0, place, gradient.to(total.dtype))
+    for name, start, where, gradients in room.joined:
+        rows = totals[name][start : start + len(gradients)]
+        rows.scatter_add_(1, where.expand_as(gradients), gradients.to(rows.dtype))
 
 
 def _scatter_in_kernel(part: Part, reads: Reads, moved: list[Moved]) -> None:

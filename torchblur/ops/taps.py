@@ -299,6 +299,7 @@ def _pull(
         signature = tuple((name, t.shape, t.dtype) for name, t in named.items())
         kernel, names = job.kernel, tuple(scattered)
         reads = reads_of(kernel.tap, kernel.options, signature, names, job.lists.color_from)
+    room = room_for(scattered, reads, grads[0])
     part = Part(
         wanted=lists,
         parameters=parameters,
@@ -309,12 +310,12 @@ def _pull(
         peaks=peaks,
         taken=tuple(torch.zeros_like(peak, dtype=torch.bool) for peak in peaks),
         scattered=scattered,
-        moved=room_for(reads, grads[0]),
+        moved=room.planes,
     )
     groups, number = _groups(job.num_samples, floating(named))
     for indices in groups:
         job.kernel.pull(indices, number, part, reads, job.lists.color_from)
-        scatter(part, reads)
+        scatter(scattered, room)
     return {name: total.sum_to_size(leaves[name].shape) for name, total in part.totals.items()}
 
 
