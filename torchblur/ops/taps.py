@@ -39,7 +39,7 @@ from torchblur.ops.tap_kernels import (
 
 __all__ = ["Engine", "Inputs", "Lists", "Planes", "TapFunction", "sum_taps"]
 
-_PART = {"eager": 1 << 16, "compiled": 300_000}
+_PART = {"eager": 1 << 16, "compiled": 320_000}
 """Pixels that a CPU takes through all taps at once: what they need should stay in its caches, which
 is more for an eager tap, and the time of each call should not count. With sets of parameters it is
 their mean number over all planes that counts."""
