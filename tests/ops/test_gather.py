@@ -104,6 +104,24 @@ def test_compiled_gradient_of_a_texture_in_any_layout(monkeypatch, strided, apar
     assert any(left) == apart
 
 
+def alternating_tap(index, count, inputs, options):
+    """Read two channels by turns, in different places."""
+    x, y = inputs["x"] + index, inputs["y"]
+    reads = [read(inputs, x + i, y, channels=slice(i % 2, i % 2 + 1))[0] for i in range(4)]
+    return tuple((i + 1) * plane for i, plane in enumerate(reads)), 0 * x
+
+
+def test_compiled_gradients_of_lookups_that_take_turns():
+    grads = []
+    for engine in ("eager", "compiled"):
+        inputs = make_inputs(dtype=torch.float32)
+        leaf = inputs["texture"].requires_grad_()
+        gather(alternating_tap, None, 3, inputs, engine)[0].square().sum().backward()
+        grads.append(leaf.grad)
+    assert grads[0].any()
+    assert torch.allclose(*grads, rtol=1e-5)
+
+
 def partly_linear_tap(index, count, inputs, options):
     x, y = inputs["x"] + 0.4 * index, inputs["y"] + 0.3 * index
     return read(inputs, x, y, "bilinear", linear=inputs["linear"] > 0), 0 * x

@@ -41,8 +41,8 @@ __all__ = ["Engine", "Inputs", "Lists", "Planes", "TapFunction", "sum_taps"]
 
 _PART = {"eager": 1 << 16, "compiled": 320_000}
 """Pixels that a CPU takes through all taps at once: what they need should stay in its caches, which
-is more for an eager tap, and the time of each call should not count. With sets of parameters it is
-their mean number over all planes that counts."""
+is more for an eager tap, and the time of each call should not count (tuned on one Xeon). With sets
+of parameters it is their mean number over all planes that counts."""
 _LEAST_PART = 1 << 10  # pixels; with fewer, calls cost more than what they do
 _TAPS_PER_CALL = {"cpu": 1, "cuda": 4}
 """Taps that one kernel adds: on a GPU each pass over the planes serves several. More of them take
@@ -204,10 +204,10 @@ class _Sum:
         return [slice(start, stop) for start, stop in itertools.pairwise(ends)]
 
     def part(self, tensor: Tensor, part: slice | None) -> Tensor:
-        """Return a part of a list, and anything else as it is.
+        """Return a copy of a part of a list, and anything else as it is.
 
-        It has the strides of its shape, no offset and no base: any other layout, even of dimensions
-        of one, would be compiled anew.
+        A copy, as sums are kept up in place. It has the strides of its shape, no offset and no
+        base: any other layout, even of dimensions of one, would be compiled anew.
         """
         if not self.is_list(tensor):
             return tensor
