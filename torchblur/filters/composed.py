@@ -10,7 +10,13 @@ from torch import Tensor
 
 from torchblur.filters.base import BlurFilter, Values
 from torchblur.filters.composed_config import ComposedConfig
-from torchblur.filters.composed_gather import alternate_tap, pair_tap, shared_inputs, tap_options
+from torchblur.filters.composed_gather import (
+    TapOptions,
+    alternate_tap,
+    pair_tap,
+    shared_inputs,
+    tap_options,
+)
 from torchblur.filters.composed_motion import clean_edges, half_spreads
 from torchblur.filters.composed_times import fill_hidden, time_tap
 from torchblur.filters.guertin2014 import center_direction
@@ -18,6 +24,7 @@ from torchblur.filters.moving import moving_pixels, packed_values, tile_planes
 from torchblur.filters.notes2025_gather import Blurred, Line, Sums, compose
 from torchblur.filters.notes2025_postfilter import post_filter
 from torchblur.filters.places import SHORTEST_REACH, num_pairs
+from torchblur.filters.reach import Gather, by_length, tap_counts
 from torchblur.filters.reconstruction import color_from, resolve, texture_of
 from torchblur.filters.revealed import revealed_inputs
 from torchblur.filters.spreads import Spread
@@ -196,7 +203,7 @@ def _lines(
     if len(ways) > 1:
         ways = {name: way for name, way in ways.items() if name != "reversed"}
     for number, (name, way) in enumerate(ways.items()):
-        plane, most, used = torch.full_like(way.reach, float(pairs)), pairs, moving
+        plane, most, used = tap_counts(values, way.reach, pairs), pairs, moving
         if number == 0 and values.double_samples and values.sampling == "pairs":
             plane, most = torch.where(linear, plane, 2 * plane), 2 * pairs
         if name == "second" and "first" in ways:
@@ -223,8 +230,14 @@ def _gather(
         for name, line in lines.items():
             reach = ways[name].reach.clamp_min(SHORTEST_REACH)
             inputs = shared | ways[name].line() | {"reach": reach, "pairs": line.pairs}
-            totals = gather_lists(
-                pair_tap, options, line.most_pairs, inputs, pixels, engine, color_from=first_channel
+            totals = by_length(
+                _pair_gather(options, line, values, engine, first_channel),
+                values,
+                reach,
+                inputs,
+                pixels,
+                num_pairs(values),
+                means=True,
             )
             area = values.area_slope * reach if values.accurate_alpha else None
             found.append(_means(totals, 2 * line.pairs, line, area, values))
@@ -236,14 +249,43 @@ def _gather(
     for name, one in ways.items():
         inputs |= components(f"{name}_vector", one.vector) if timed else one.line(f"{name}_")
     tap = time_tap if timed else alternate_tap
-    totals = gather_lists(
-        tap, options, values.num_samples, inputs, pixels, engine, color_from=first_channel
+    totals = by_length(
+        lambda taps, lists, some: gather_lists(
+            tap, options, taps, lists, some, engine, color_from=first_channel
+        ),
+        values,
+        _longest(ways, shared),
+        inputs,
+        pixels,
+        values.num_samples,
     )
     if options.fill_hidden and timed:
         totals = (*fill_hidden(totals[0], totals[1], values.background_gain), *totals[2:])
     spreads = values.accurate_alpha and values.sampling == "alternate"
     area = values.area_slope * way.reach if spreads else None
     return [_means(totals, count, line, area, values)]
+
+
+def _pair_gather(
+    options: TapOptions, line: Line, values: Values, engine: Engine, first_channel: int
+) -> Gather:
+    """Return the gather of one line; pixels whose taps are doubled have twice as many pairs."""
+    times = line.most_pairs // num_pairs(values)
+
+    def gather(pairs: int, lists: Inputs, pixels: PixelList) -> tuple[Tensor, ...]:
+        return gather_lists(
+            pair_tap, options, pairs * times, lists, pixels, engine, color_from=first_channel
+        )
+
+    return gather
+
+
+def _longest(ways: dict[str, _Way], shared: Inputs) -> Tensor:
+    """Return half of the longest path among the directions and the pixel's own, px."""
+    longest = shared["length"]
+    for way in ways.values():
+        longest = torch.maximum(longest, length(way.vector))
+    return longest
 
 
 def _means(

@@ -30,6 +30,10 @@ _ALL = (
     "noise",
     "seed",
     "depth_level",
+    "reach",
+    "max_reach",
+    "tap_spacing",
+    "max_samples",
 )
 _RAMP = ("spread_offset", "spread_slope", "spread_compare", "mirror_filter")
 

@@ -7,7 +7,8 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from torchblur.filters.base import Values
-from torchblur.filters.spreads import Spread, exact_spread, longest_spread, tile_motions
+from torchblur.filters.reach import code_range, longest_spread
+from torchblur.filters.spreads import Spread, exact_spread, tile_motions
 from torchblur.frame import Frame
 from torchblur.ops.directions import TileDirections
 from torchblur.ops.velocity import clamp_length, half_velocity, quantize_uint8
@@ -48,7 +49,7 @@ def _around(plane: Tensor) -> Tensor:
 
 def half_spreads(frame: Frame, values: Values) -> tuple[Spread, TileDirections]:
     """Return half spreads per pixel, exactly 0 where still, and both motions per tile."""
-    size = values.tile_size
+    size = code_range(values)
     longest = longest_spread(values)
     whole = half_velocity(frame.velocity, values.shutter)
     half = clamp_length(whole, longest)

@@ -10,6 +10,7 @@ from torch import Tensor
 from torchblur.filters.base import BlurFilter, Values
 from torchblur.filters.guertin2014_config import Guertin2014Config
 from torchblur.filters.moving import Filtered, Moving, Stray, moving_part, revealed_part
+from torchblur.filters.reach import by_length
 from torchblur.filters.reconstruction import WEIGHT_PARAMETERS, Tap, is_one, resolve, sample
 from torchblur.filters.spreads import Spread, per_image, tiles_of
 from torchblur.frame import Frame, Shutter
@@ -119,14 +120,16 @@ def _filtered(frame: Frame, values: Values, engine: Engine) -> Filtered:
         return Filtered.still(frame, tiles, "weight", "moving")
     inputs = _tap_inputs(part, tiles.get("tile_variance"))
     inputs |= revealed_part(frame, values, part, lambda f, v: _filtered(f, v, engine).color(f))
-    sums = gather_lists(
-        _tap,
-        _options(values),
-        values.num_samples,
+    options = _options(values)
+    sums = by_length(
+        lambda count, lists, pixels: gather_lists(
+            _tap, options, count, lists, pixels, engine, color_from=part.color_from
+        ),
+        values,
+        inputs["reach"],
         inputs,
         part.pixels,
-        engine,
-        color_from=part.color_from,
+        values.num_samples,
     )
     center_weight = values.num_samples / (part.values.kappa * inputs["length_p"])
     if not values.center_weight:

@@ -9,8 +9,16 @@ from torch import Tensor
 
 from torchblur.filters.base import BlurFilter, Values
 from torchblur.filters.jimenez2014_config import Jimenez2014Config
-from torchblur.filters.moving import Filtered, Moving, Stray, moving_part, revealed_part
+from torchblur.filters.moving import (
+    Filtered,
+    Moving,
+    Stray,
+    least_spread,
+    moving_part,
+    revealed_part,
+)
 from torchblur.filters.places import SHORTEST_REACH, num_pairs, tap_shift, tile_noise
+from torchblur.filters.reach import by_length, code_range
 from torchblur.filters.reconstruction import Tap, sample
 from torchblur.filters.spreads import pixel_spread, tiles_of
 from torchblur.frame import Frame, Shutter
@@ -24,8 +32,9 @@ from torchblur.ops.gather import (
     vector,
     weighted,
 )
+from torchblur.ops.pixels import PixelList
 from torchblur.ops.spread import Mirror, SpreadForm, TapPair, depth_shares, mirror, spread_weight
-from torchblur.ops.tiles import neighbor_min, tile_lookup, tile_min
+from torchblur.ops.tiles import tile_lookup
 from torchblur.ops.velocity import direction, length, quantize_uint8
 
 __all__ = ["Jimenez2014Blur", "Jimenez2014Config", "jimenez2014"]
@@ -101,8 +110,8 @@ class Jimenez2014Blur(BlurFilter):
 def _filtered(frame: Frame, values: Values, engine: Engine) -> Filtered:
     own, around = tiles_of(frame, values, cull=values.neighbor_culling)
     if values.tile_encoding == "uint8":
-        own, around = (quantize_uint8(tile, values.tile_size) for tile in (own, around))
-    shortest = neighbor_min(tile_min(pixel_spread(frame, values).length, values.tile_size))
+        own, around = (quantize_uint8(tile, code_range(values)) for tile in (own, around))
+    shortest = least_spread(pixel_spread(frame, values).length, around, values)
     tiles = {"tile_max": own, "neighbor_max": around, "tile_min": shortest}
     part = moving_part(frame, values, around, stray=Stray(tile_noise(values), values.tile_jitter))
     if part is None:
@@ -118,7 +127,14 @@ def _filtered(frame: Frame, values: Values, engine: Engine) -> Filtered:
         values.color_lookup,
     )
     pairs = num_pairs(values)
-    sums = _sums(part, tile_class, options, pairs, inputs, engine)
+    sums = by_length(
+        lambda count, lists, pixels: _sums(part, options, count, lists, pixels, engine),
+        values,
+        inputs["reach"],
+        inputs | {"tile_class": tile_class},
+        part.pixels,
+        pairs,
+    )
     color, alpha = (total / (2 * pairs) for total in sums)
     lists = {
         "color": torch.where(tile_class > 0, _fill(part.frame, color, alpha), part.frame.color),
@@ -129,18 +145,20 @@ def _filtered(frame: Frame, values: Values, engine: Engine) -> Filtered:
 
 
 def _sums(
-    part: Moving, tile_class: Tensor, options: _Options, pairs: int, inputs: Inputs, engine: Engine
+    part: Moving, options: _Options, pairs: int, inputs: Inputs, pixels: PixelList, engine: Engine
 ) -> tuple[Tensor, Tensor]:
     """Return sums of color and weight: of weighed taps in the full class, of plain in the fast.
 
     Args:
-        part: The pixels.
-        tile_class: Of each pixel, (1, 1, 1, M).
+        part: The part of the frame that moves.
         options: Of the taps.
         pairs: Number of pairs.
-        inputs: Of the taps, as lists.
+        inputs: Of the taps, as lists of some pixels, and "tile_class".
+        pixels: Those.
         engine: Of the gathers.
     """
+    tile_class = inputs["tile_class"]
+    inputs = {name: plane for name, plane in inputs.items() if name != "tile_class"}
     kinds = [(2, _pair)] + ([(1, _plain_pair)] if part.values.tile_classes else [])
     found = [
         gather_some(
@@ -148,7 +166,7 @@ def _sums(
             options,
             pairs,
             inputs,
-            part.pixels,
+            pixels,
             tile_class == number,
             engine,
             color_from=part.color_from,

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Annotated, Literal
 
 from torchblur.filters.places import PairNoise
+from torchblur.filters.reach import ReachConfig
 from torchblur.filters.revealed import RevealedBackgroundConfig
 from torchblur.ops.gather import Lookup
 from torchblur.ops.spread import Mirror, SpreadForm
@@ -16,7 +17,7 @@ _SLIDES = "Jimenez 2014, as in public ports"
 
 
 # fmt: off
-class Jimenez2014Config(RevealedBackgroundConfig):
+class Jimenez2014Config(RevealedBackgroundConfig, ReachConfig):
     """Parameters of Jimenez 2014; the defaults are those of the ports that agree."""
 
     num_samples: Annotated[

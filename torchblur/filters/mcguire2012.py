@@ -9,6 +9,7 @@ from torch import Tensor
 
 from torchblur.filters.base import BlurFilter, Values
 from torchblur.filters.moving import Filtered, Moving, moving_part, revealed_part
+from torchblur.filters.reach import by_length
 from torchblur.filters.reconstruction import (
     WEIGHT_PARAMETERS,
     ReconstructionConfig,
@@ -139,8 +140,15 @@ def _filtered(frame: Frame, values: Values, engine: Engine) -> Filtered:
         values.softness,
         values.color_lookup,
     )
-    sums = gather_lists(
-        _tap, options, values.num_samples, inputs, part.pixels, engine, color_from=part.color_from
+    sums = by_length(
+        lambda count, lists, pixels: gather_lists(
+            _tap, options, count, lists, pixels, engine, color_from=part.color_from
+        ),
+        values,
+        inputs["reach"],
+        inputs,
+        part.pixels,
+        values.num_samples,
     )
     local = part.values
     center_weight = local.center_gain / torch.maximum(part.spread.length, local.min_length)

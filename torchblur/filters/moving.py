@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import replace
 from typing import NamedTuple
@@ -12,6 +13,7 @@ from torch import Tensor
 
 from torchblur.filters.base import Values
 from torchblur.filters.places import tile_noise
+from torchblur.filters.reach import longest_spread, swept_times
 from torchblur.filters.reconstruction import color_from, texture_of
 from torchblur.filters.revealed import revealed_inputs
 from torchblur.filters.spreads import Spread, pixel_spread
@@ -20,6 +22,7 @@ from torchblur.ops.directions import TileDirections
 from torchblur.ops.gather import Inputs
 from torchblur.ops.noise import NoiseKind, noise_plane
 from torchblur.ops.pixels import PixelList, positions, select, takes_all_pixels
+from torchblur.ops.reaching import least_along
 from torchblur.ops.tiles import neighbor_min, tile_lookup, tile_min, tile_offset
 from torchblur.ops.velocity import length
 
@@ -28,6 +31,7 @@ __all__ = [
     "Moving",
     "Stray",
     "Window",
+    "least_spread",
     "moving_among",
     "moving_part",
     "moving_pixels",
@@ -167,7 +171,7 @@ def moving_part(
     if pixels.index is None:
         texture = pixels.unpack(texture_of(here, spread))
     else:
-        far = -(-(values.tile_size + margin) // values.tile_size)
+        far = math.ceil((_farthest(neighborhood, values) + margin) / values.tile_size)
         reached = _dilated(wanted, far) > 0
         window = Window.around(reached, values.tile_size)
         there = layers.map(window.of)
@@ -226,8 +230,30 @@ def tile_planes(
     edge = values.tile_size
     noise = noise_plane(tile_noise(values), color, 1, values.seed, pixels)
     offset = tile_offset(color, noise, edge, pixels.pack(values.tile_jitter), pixels)
-    least = neighbor_min(tile_min(size.detach(), edge))
+    least = least_spread(size, tiles.primary, values)
     return [tile_lookup(t, color, edge, offset, pixels=pixels) for t in (*tiles, least)]
+
+
+def least_spread(size: Tensor, tiles: Tensor, values: Values) -> Tensor:
+    """Return the shortest half spread that the taps of each tile may meet, px, (B, 1, Ty, Tx).
+
+    Args:
+        size: Half spread of all pixels, px, (B, 1, H, W).
+        tiles: Along what taps lie, px, (B, 2, Ty, Tx).
+        values: `reach`, `tile_size`, the shutter's position.
+    """
+    edge = values.tile_size
+    least = tile_min(size.detach(), edge)
+    if values.reach == "tile":
+        return neighbor_min(least)
+    return least_along(least, tiles, edge, longest_spread(values), swept_times(values))
+
+
+def _farthest(neighborhood: Tensor, values: Values) -> float:
+    """Return how far from its pixel a tap can lie, px."""
+    if values.reach == "tile":
+        return float(values.tile_size)
+    return float(length(neighborhood.detach()).amax()) * max(map(abs, swept_times(values)))
 
 
 def revealed_part(

@@ -22,9 +22,10 @@ from torchblur.filters.notes2025_gather import (
 )
 from torchblur.filters.notes2025_postfilter import post_filter
 from torchblur.filters.places import num_pairs
+from torchblur.filters.reach import code_range, longest_spread, tap_counts
 from torchblur.filters.reconstruction import color_from
 from torchblur.filters.revealed import layer_behind, revealed_inputs
-from torchblur.filters.spreads import Spread, exact_spread, longest_spread, tile_motions
+from torchblur.filters.spreads import Spread, exact_spread, tile_motions
 from torchblur.frame import Frame
 from torchblur.ops.directions import TileDirections
 from torchblur.ops.gather import Engine
@@ -151,7 +152,7 @@ def _motion(frame: Frame, values: Values) -> tuple[Spread, TileDirections]:
     Tiles choose by the length before it is clamped: clamped vectors are all equally long, and
     rounding would choose among them.
     """
-    size = values.tile_size
+    size = code_range(values)
     longest = longest_spread(values)
     whole = half_velocity(frame.velocity, values.shutter)
     half = clamp_length(whole, longest)
@@ -165,7 +166,7 @@ def _motion(frame: Frame, values: Values) -> tuple[Spread, TileDirections]:
 def _lines(first: Tensor, second: Tensor, least: Tensor, values: Values) -> list[Line]:
     """Return the directions that are sampled, how densely, and where taps need no weights."""
     pairs = num_pairs(values)
-    plane = torch.full_like(first[:, :1], float(pairs))
+    plane = tap_counts(values, length(first), pairs)
     moving, alike = length(first) > values.early_out, least >= values.fast_ratio * length(first)
     doubled, most = plane, pairs
     if values.double_samples:
@@ -177,7 +178,8 @@ def _lines(first: Tensor, second: Tensor, least: Tensor, values: Values) -> list
         cosine = unit.sum(1, keepdim=True).abs()
         apart = cosine < torch.cos(values.min_angle * (math.pi / 180))
         used = moving & apart & (length(second) > values.early_out)
-        others, alike = [Line(second, used, plane, pairs)], alike & ~used
+        other = tap_counts(values, length(second), pairs)
+        others, alike = [Line(second, used, other, pairs)], alike & ~used
     return [Line(first, moving, doubled, most, alike if values.tile_classes else None), *others]
 
 
@@ -212,7 +214,8 @@ def _halved(frame: Frame, values: Values) -> Values:
         for key, value in vars(values).items()
     }
     small["tile_size"] = (values.tile_size + 1) // 2
-    small["early_out"] = small["early_out"] / 2
+    for name in ("early_out", "max_reach", "tap_spacing"):
+        small[name] = small[name] / 2
     return Values(**small)
 
 

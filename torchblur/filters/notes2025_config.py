@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Annotated, Literal
 
 from torchblur.filters.places import PairNoise
+from torchblur.filters.reach import ReachConfig
 from torchblur.filters.revealed import RevealedBackgroundConfig
 from torchblur.ops.directions import DirectionReduction
 from torchblur.ops.spread import Mirror, SpreadForm
@@ -24,7 +25,7 @@ _CORNERS = "rounds the corners of the clamped weights, so that gradients pass th
 
 
 # fmt: off
-class Notes2025Config(RevealedBackgroundConfig):
+class Notes2025Config(RevealedBackgroundConfig, ReachConfig):
     """Parameters of the 2025 notes. The defaults are full resolution with all that it has.
 
     Where the text builds one direction it goes with ``depth_level=0.5`` and without direction

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from torchblur.filters.base import Values
 from torchblur.filters.places import SHORTEST_REACH, num_pairs, tap_shift
+from torchblur.filters.reach import by_length
 from torchblur.filters.reconstruction import ColorLookup, Tap, sample, texture_of
 from torchblur.filters.spreads import Spread
 from torchblur.frame import Frame, Shutter
@@ -177,22 +178,33 @@ def gather_line(
     kinds = [(_pair, line.used)]
     if line.plain is not None:
         kinds = [(_pair, line.used & ~line.plain), (_plain_pair, line.used & line.plain)]
-    found = [
-        gather_some(
-            tap,
-            options,
-            line.most_pairs,
-            inputs,
-            pixels,
-            wanted,
-            engine,
-            num_maxima=1,
-            color_from=color_from,
-        )
-        for tap, wanted in kinds
-    ]
-    *totals, influence = (sum(planes[1:], planes[0]) for planes in zip(*found, strict=True))
-    *sums, alpha = (total / (2 * line.pairs) for total in totals)
+    least = num_pairs(values)
+
+    def means(count: int, lists: Inputs, some: PixelList) -> tuple[Tensor, ...]:
+        """Return means over so many pairs; pixels whose taps are doubled have twice as many."""
+        lists = dict(lists)
+        wanted = [lists.pop(f"wanted_{number}") > 0 for number in range(len(kinds))]
+        found = [
+            gather_some(
+                tap,
+                options,
+                count * line.most_pairs // least,
+                lists,
+                some,
+                chosen,
+                engine,
+                num_maxima=1,
+                color_from=color_from,
+            )
+            for (tap, _), chosen in zip(kinds, wanted, strict=True)
+        ]
+        *totals, most = (sum(planes[1:], planes[0]) for planes in zip(*found, strict=True))
+        return *(total / (2 * lists["pairs"]) for total in totals), most
+
+    masks = {f"wanted_{i}": wanted.to(reach.dtype) for i, (_, wanted) in enumerate(kinds)}
+    *sums, alpha, influence = by_length(
+        means, values, reach, inputs | masks, pixels, least, means=True
+    )
     if values.accurate_alpha:
         alpha = alpha * (1 + values.area_slope * reach)
     alpha = saturate(values.alpha_gain * alpha, values.softness)

@@ -8,7 +8,7 @@ from typing import Annotated, Literal, NamedTuple
 import torch
 from torch import Tensor
 
-from torchblur.filters.base import FilterConfig
+from torchblur.filters.reach import ReachConfig
 from torchblur.filters.revealed import background_share
 from torchblur.filters.spreads import Spread
 from torchblur.frame import Frame
@@ -39,7 +39,7 @@ TEXTURE_COLOR = 4
 _WEIGHTS = "McGuire 2012, section 3.3 (restated by Tan 2022, appendix, eq. 5-10)"
 
 
-class ReconstructionConfig(FilterConfig):
+class ReconstructionConfig(ReachConfig):
     """Constants of the cone, cylinder and depth weights, and of the lookups."""
 
     num_samples: Annotated[

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from torchblur.filters.base import BlurFilter, Values
+from torchblur.filters.reach import by_length, longest_spread
 from torchblur.filters.reconstruction import (
     WEIGHT_PARAMETERS,
     ReconstructionConfig,
@@ -17,7 +18,7 @@ from torchblur.filters.reconstruction import (
     sample,
     texture_of,
 )
-from torchblur.filters.spreads import Spread, Tiles, longest_spread, spread_of
+from torchblur.filters.spreads import Spread, Tiles, around_tiles, spread_of
 from torchblur.frame import Frame, Shutter
 from torchblur.ops.gather import (
     Engine,
@@ -25,14 +26,14 @@ from torchblur.ops.gather import (
     Lookup,
     Planes,
     components,
-    gather,
+    gather_lists,
     pixel_grid,
     vector,
     weighted,
 )
 from torchblur.ops.noise import NoiseKind, noise_plane
 from torchblur.ops.pixels import PixelList
-from torchblur.ops.tiles import neighbor_max, tile_lookup, tile_max
+from torchblur.ops.tiles import tile_lookup, tile_max
 from torchblur.ops.velocity import (
     clamp_length,
     direction,
@@ -190,7 +191,7 @@ def _spread(frame: Frame, values: Values) -> tuple[Spread, Tiles]:
     half = quantize_gamma2(half, longest)
     tiles = tile_max(half, values.tile_size)
     unit, size = direction(half), quantize_linear(length(half), longest)
-    return Spread(unit * size, size, unit), Tiles(tiles, neighbor_max(tiles))
+    return Spread(unit * size, size, unit), Tiles(tiles, around_tiles(tiles, values))
 
 
 def _pass(
@@ -224,9 +225,17 @@ def _pass(
     moving = reach > values.early_out
     active = PixelList.where(moving)
     least = color_from(frame, spread)
-    sums = gather(
-        _tap, options, values.num_samples, inputs, engine, active=active, color_from=least
+    sums = by_length(
+        lambda count, lists, pixels: gather_lists(
+            _tap, options, count, lists, pixels, engine, color_from=least
+        ),
+        values,
+        active.pack(reach),
+        active.lists(inputs),
+        active,
+        values.num_samples,
     )
+    sums = tuple(active.unpack(total) for total in sums)
     center_weight = values.center_gain / inputs["length_p"]
     return resolve(frame, sums, center_weight, moving)
 

@@ -8,16 +8,18 @@ import torch
 from torch import Tensor
 
 from torchblur.filters.base import Values
-from torchblur.frame import Frame, Shutter
+from torchblur.filters.reach import code_range, longest_spread, swept_times
+from torchblur.frame import Frame
 from torchblur.ops.directions import TileDirections, tile_directions
+from torchblur.ops.reaching import longest_reaching, reaching_directions
 from torchblur.ops.tiles import neighbor_max, tile_max
 from torchblur.ops.velocity import clamp_length, direction, half_velocity, length, quantize_uint8
 
 __all__ = [
     "Spread",
     "Tiles",
+    "around_tiles",
     "exact_spread",
-    "longest_spread",
     "per_image",
     "pixel_spread",
     "spread_of",
@@ -71,13 +73,8 @@ def pixel_spread(frame: Frame, values: Values, *, uint8: bool = False) -> Spread
     """
     half = half_velocity(frame.velocity, values.shutter, longest_spread(values))
     if uint8:
-        half = quantize_uint8(half, values.tile_size)
+        half = quantize_uint8(half, code_range(values))
     return Spread(half, length(half), direction(half))
-
-
-def longest_spread(values: Values) -> float:
-    """Return the longest half spread that the tiles can reach, px."""
-    return float(values.tile_size / (1 + abs(Shutter(1, values.shutter_position).center)))
 
 
 def tiles_of(frame: Frame, values: Values, *, uint8: bool = False, cull: bool = False) -> Tiles:
@@ -94,14 +91,27 @@ def tiles_of(frame: Frame, values: Values, *, uint8: bool = False, cull: bool = 
     """
     if uint8:
         tiles = tile_max(pixel_spread(frame, values, uint8=True).half, values.tile_size)
-        return Tiles(tiles, neighbor_max(tiles, cull=cull))
+        return Tiles(tiles, around_tiles(tiles, values, cull=cull))
     if values.shutter.ndim == 4 and values.shutter.shape[-2:] == frame.size:
         tiles = tile_max(half_velocity(frame.velocity, values.shutter), values.tile_size)
     else:  # one factor for all pixels of an image does not change which is the longest
         tiles = half_velocity(tile_max(frame.velocity, values.tile_size), values.shutter)
     longest = longest_spread(values)
-    around = neighbor_max(tiles, cull=cull)
+    around = around_tiles(tiles, values, cull=cull)
     return Tiles(clamp_length(tiles, longest), clamp_length(around, longest))
+
+
+def around_tiles(tiles: Tensor, values: Values, *, cull: bool = False) -> Tensor:
+    """Return the longest vector of the 3x3 tiles, or of all whose motion reaches the tile.
+
+    Args:
+        tiles: Longest half spread per tile, px, (B, 2, Ty, Tx).
+        values: `reach`, `max_reach`, `tile_size`.
+        cull: With tiles as the reach: leave out diagonal ones that cannot reach the middle one.
+    """
+    if values.reach == "tile":
+        return neighbor_max(tiles, cull=cull)
+    return longest_reaching(tiles, values.tile_size, longest_spread(values), swept_times(values))
 
 
 def exact_spread(half: Tensor) -> Spread:
@@ -121,10 +131,20 @@ def tile_motions(half: Tensor, values: Values, *, two: bool) -> TileDirections:
 
     Args:
         half: Half spreads of the pixels, px, (B, 2, H, W).
-        values: `tile_size`, `neighbor_culling`; `direction_reduction`, `secondary_exponent`.
+        values: `tile_size`, `reach`, `neighbor_culling`; `direction_reduction` (where tiles are
+            the reach), `secondary_exponent`.
         two: Whether the second is wanted; else it is 0.
     """
     size, cull = values.tile_size, values.neighbor_culling
+    if values.reach == "frame":
+        return reaching_directions(
+            half,
+            size,
+            longest_spread(values),
+            swept_times(values),
+            two=two,
+            exponent=per_image(values.secondary_exponent) if two else 2.0,
+        )
     if two:
         return tile_directions(
             half,

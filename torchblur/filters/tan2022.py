@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from torchblur.filters.base import BlurFilter, Values
+from torchblur.filters.reach import by_length
 from torchblur.filters.reconstruction import (
     WEIGHT_PARAMETERS,
     Tap,
@@ -28,7 +29,7 @@ from torchblur.ops.gather import (
     Lookup,
     Planes,
     components,
-    gather,
+    gather_lists,
     pixel_grid,
     vector,
     weighted,
@@ -227,15 +228,18 @@ def _gather(
     )
     moving = length(dominant) > values.early_out
     active = PixelList.where(moving)
-    front_color, front, back_color, back = gather(
-        _tap,
-        options,
+    least = color_from(frame, scaled)
+    totals = by_length(
+        lambda count, lists, pixels: gather_lists(
+            _tap, options, count, lists, pixels, engine, color_from=least
+        ),
+        values,
+        active.pack(length(dominant)),
+        active.lists(inputs),
+        active,
         values.num_samples,
-        inputs,
-        engine,
-        active=active,
-        color_from=color_from(frame, scaled),
     )
+    front_color, front, back_color, back = (active.unpack(total) for total in totals)
     center = values.center_gain / inputs["length"]
     return _Sums(front_color, front, back_color, back, center, moving)
 

@@ -11,7 +11,13 @@ from torch import Tensor
 from torchblur.ops.tiles import neighbor_max, tile_max
 from torchblur.ops.velocity import direction, length
 
-__all__ = ["DirectionReduction", "TileDirections", "secondary_score", "tile_directions"]
+__all__ = [
+    "DirectionReduction",
+    "TileDirections",
+    "best_in_tiles",
+    "secondary_score",
+    "tile_directions",
+]
 
 DirectionReduction = Literal["exact", "hierarchical"]
 
@@ -89,6 +95,25 @@ def tile_directions(
     second = _best_in_windows([cells, second], tiles, step, exponent)
     primary = neighbor_max(tiles, cull=cull)
     return TileDirections(primary, _best_of_neighbors([tiles, second], primary, cull, exponent))
+
+
+def best_in_tiles(
+    velocity: Tensor, primary: Tensor, tile_size: int, exponent: float | Tensor = 2.0
+) -> Tensor:
+    """Return, per tile, the pixel's vector with the highest score against the tile's primary.
+
+    Args:
+        velocity: Displacements in px, (B, 2, H, W).
+        primary: The direction that is taken already, px, (B, 2, Ty, Tx).
+        tile_size: r, the edge of a tile in px.
+        exponent: See `secondary_score`; a number or (B, 1, 1, 1).
+
+    Returns:
+        Displacements in px, (B, 2, Ty, Tx).
+
+    Differentiable: in the selected vectors.
+    """
+    return _best_in_windows([velocity], primary, tile_size, exponent)
 
 
 def _padded(planes: Tensor, multiple: int) -> Tensor:

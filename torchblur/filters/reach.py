@@ -1,0 +1,166 @@
+"""How far a filter blurs: by its tiles, as papers have it, or as far as the frame moves."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Annotated, Literal
+
+import torch
+from torch import Tensor
+
+from torchblur.filters.base import FilterConfig, Values
+from torchblur.frame import Shutter
+from torchblur.ops.gather import Inputs
+from torchblur.ops.pixels import PixelList, select, takes_all_pixels
+from torchblur.params import Param
+
+__all__ = [
+    "Gather",
+    "ReachConfig",
+    "by_length",
+    "code_range",
+    "longest_spread",
+    "swept_times",
+    "tap_counts",
+]
+
+Sums = tuple[Tensor, ...]
+Gather = Callable[[int, Inputs, PixelList], Sums]
+
+
+# fmt: off
+class ReachConfig(FilterConfig):
+    """The longest blur, and how densely long ones are sampled."""
+
+    reach: Annotated[Literal["tile", "frame"], Param(
+        grad="discrete", source="tile: McGuire 2012, section 3; frame: torchblur",
+        meaning="the longest half spread that is blurred: a tile, or as long as the frame's "
+                "motion up to max_reach, from whatever tile it comes",
+    )] = "tile"
+    max_reach: Annotated[float, Param(
+        unit="px", low=1.0, high=4096.0, scale="log", grad="discrete", source="torchblur",
+        meaning="reach: frame: longest half spread that is blurred; what is longer is cut",
+    )] = 512.0
+    tap_spacing: Annotated[float, Param(
+        unit="px", low=0.0, high=64.0, grad="discrete", source="torchblur",
+        meaning="largest distance between neighboring taps of a path: where num_samples would "
+                "leave more there are more taps, up to max_samples; 0: num_samples everywhere",
+    )] = 0.0
+    max_samples: Annotated[int, Param(
+        unit="taps", low=1, high=1024, scale="log", grad="discrete", source="torchblur",
+        meaning="tap_spacing: most taps of a path",
+    )] = 128
+# fmt: on
+
+
+def longest_spread(values: Values) -> float:
+    """Return the longest half spread that is blurred, px.
+
+    With tiles as the limit that is a tile; taps of a shutter that is not centered reach twice as
+    far from the pixel, so that there it is half of one.
+
+    Args:
+        values: `reach`, `max_reach`, `tile_size` and the shutter's position.
+    """
+    if values.reach == "frame":
+        return float(values.max_reach)
+    return float(values.tile_size / (1 + abs(Shutter(1, values.shutter_position).center)))
+
+
+def code_range(values: Values) -> float:
+    """Return the component of a vector, px, that the greatest code of eight bits stands for."""
+    return float(values.max_reach if values.reach == "frame" else values.tile_size)
+
+
+def swept_times(values: Values) -> tuple[float, float]:
+    """Return when the shutter opens and closes, in half open intervals from the frame's time."""
+    center = Shutter(1, values.shutter_position).center
+    return center - 1.0, center + 1.0
+
+
+# -- taps that follow the length -------------------------------------------------------------------
+
+
+def by_length(
+    gather: Gather,
+    values: Values,
+    reach: Tensor,
+    lists: Inputs,
+    pixels: PixelList,
+    least: int,
+    *,
+    means: bool = False,
+) -> Sums:
+    """Return sums over as many taps as each pixel's path needs, in units of `least` taps.
+
+    Pixels are sorted into classes of least · 2^(k/2) taps, so that a longer path costs more and a
+    short one what it always did.
+
+    Args:
+        gather: Returns the sums, (P, C, 1, m), of a number of taps, lists and their pixels.
+        values: `tap_spacing`, `max_samples`, `num_samples`.
+        reach: Half of the path of each pixel, px, (P, 1, 1, M).
+        lists: The gather's inputs; lists of the pixels, textures, parameters.
+        pixels: The pixels.
+        least: Number of taps that the gather takes for `num_samples`: as many, or half in pairs.
+        means: What it returns are means over the taps, not sums.
+
+    Returns:
+        The sums, (P, C, 1, M), scaled as if all pixels had `least` taps; or the means.
+    """
+    classes = _classes(values, reach, least)
+    if len(classes) == 1:
+        count = classes[0][0]
+        return _scaled(gather(count, lists, pixels), 1 if means else least / count)
+    whole: list[Tensor] = []
+    for count, chosen in classes:
+        assert chosen is not None
+        some = {
+            name: select(plane, chosen)
+            if not name.startswith("texture") and plane.shape[3:] == (pixels.count,)
+            else plane
+            for name, plane in lists.items()
+        }
+        sums = _scaled(gather(count, some, pixels.some(chosen)), 1 if means else least / count)
+        if not whole:
+            whole = [s.new_zeros(*s.shape[:3], pixels.count) for s in sums]
+        whole = [w.index_copy(3, chosen, s) for w, s in zip(whole, sums, strict=True)]
+    return tuple(whole)
+
+
+def _scaled(sums: Sums, factor: float) -> Sums:
+    return sums if factor == 1 else tuple(plane * factor for plane in sums)
+
+
+def tap_counts(values: Values, reach: Tensor, least: int) -> Tensor:
+    """Return how many taps each pixel's path has, at least `least`, of the shape of `reach`.
+
+    A graph that is recorded once has `num_samples` everywhere.
+
+    Args:
+        values: `tap_spacing`, `max_samples`, `num_samples`.
+        reach: Half of the path of each pixel, px.
+        least: What stands for `num_samples`: as many, or half of it in pairs.
+    """
+    if values.tap_spacing <= 0 or takes_all_pixels():
+        return torch.full_like(reach, float(least))
+    steps = [least]
+    most = max(least, int(values.max_samples * least / values.num_samples))
+    while steps[-1] < most:
+        steps.append(min(most, math.ceil(least * 2 ** (len(steps) / 2))))
+    # A path of 2 reach with n taps has them 2 reach / n apart.
+    wanted = 2 * reach.detach() / values.tap_spacing / values.num_samples
+    number = (2 * wanted.clamp_min(1).log2() - 1e-4).ceil().clamp(0, len(steps) - 1)
+    return reach.new_tensor(steps, requires_grad=False)[number.long()]
+
+
+def _classes(values: Values, reach: Tensor, least: int) -> list[tuple[int, Tensor | None]]:
+    """Return numbers of taps, and which pixels take so many; None: all."""
+    if values.tap_spacing <= 0 or takes_all_pixels():
+        return [(least, None)]
+    counts = tap_counts(values, reach, least).amax(0).flatten()
+    found = counts.unique().int().tolist()
+    if len(found) == 1:
+        return [(found[0], None)]
+    return [(count, (counts == count).nonzero()[:, 0]) for count in found]
