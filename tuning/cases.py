@@ -33,6 +33,7 @@ class Case:
         shutter: The shutter that the reference was made with.
         identity: Hash of the sharp frame's source; equal for copies of one frame.
         origin: Hash of the scene, or the folder and file pattern: equal for frames of a sequence.
+        view: What part of the frame it shows, if it is a window: others of it are no repetition.
         item: Key of the data's item that it comes from; equal for frames that share its weight.
         weight: Of that item, if it has one.
     """
@@ -46,6 +47,7 @@ class Case:
     shutter: Shutter
     identity: str
     origin: str
+    view: str = ""
     item: str = ""
     weight: float | None = None
 
@@ -62,7 +64,7 @@ class Case:
     @property
     def repeats(self) -> tuple[Hashable, ...]:
         """What no other case of the same split may have."""
-        return ((self.identity, self.shutter),)
+        return ((self.identity, self.shutter, self.view),)
 
     def to(self, device: torch.device | str) -> Case:
         """Return the case with its tensors on another device."""
@@ -93,6 +95,7 @@ class SequenceCase:
         warm_up: So many frames at the start are filtered and not scored.
         identities: Hash of each frame's source; equal for copies of one frame.
         origin: Hash of the scene, or the folder and file pattern.
+        view: As in `Case`.
         seed: Seed of the stream: the same frames with another one are no repetition.
         item: As in `Case`.
         weight: As in `Case`.
@@ -110,6 +113,7 @@ class SequenceCase:
     warm_up: int
     identities: tuple[str, ...]
     origin: str
+    view: str = ""
     seed: int = 0
     item: str = ""
     weight: float | None = None
@@ -130,7 +134,8 @@ class SequenceCase:
     @property
     def repeats(self) -> tuple[Hashable, ...]:
         """What no other case of the same split may have."""
-        return tuple((identity, self.shutter, self.seed) for identity in self.identities)
+        shared = (self.shutter, self.seed, self.view)
+        return tuple((identity, *shared) for identity in self.identities)
 
     def steps(self, blur: BlurFilter | None = None) -> tuple[tuple[Frame, ...], ...]:
         """Return what a filter is given at each time step: one frame, or several of one place.

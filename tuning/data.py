@@ -29,6 +29,7 @@ from tuning.data_config import (
 )
 from tuning.drawing import drawn_scenes
 from tuning.frame_cache import cache_folder, cache_key, cached, frame_of, planes_of
+from tuning.framing import cached_box, seen_through, view_of
 from tuning.numbering import frame_numbers, numbered_file
 from tuning.streams import ExrStreamJob, SceneStreamJob
 
@@ -96,12 +97,15 @@ class _SceneJob:
 
     @property
     def name(self) -> str:
-        return f"{self.stem} {self.time:g}"
+        return f"{self.stem} {self.time:g}{self.item.suffix}"
 
     def load(self, split: str) -> Case:
+        box = cached_box(self.scene, self.item, self.time, self.item.exposure)
+        scene = seen_through(self.scene, self.item, box)
+        settings = self.item.model_dump(exclude={"path", "frames", "weight", "of", "at"})
+        key = cache_key(scene.fingerprint(), settings, self.time)
+        tensors = cached(key, lambda: self._render(scene))
         scene_key = self.scene.fingerprint()
-        settings = self.item.model_dump(exclude={"path", "frames", "weight"})
-        tensors = cached(cache_key(scene_key, settings, self.time), self._render)
         frame = frame_of(tensors, "frame", self.name)
         return Case(
             name=self.name,
@@ -113,10 +117,11 @@ class _SceneJob:
             shutter=self.item.exposure,
             identity=f"{scene_key} {self.time}",
             origin=scene_key,
+            view=view_of(self.item, box),
         )
 
-    def _render(self) -> dict[str, Tensor]:
-        item, scene = self.item, self.scene
+    def _render(self, scene: Scene) -> dict[str, Tensor]:
+        item = self.item
         size = item.height_width
         frame = render_frame(scene, size, frame=self.time, color_spp=item.color_spp, seed=item.seed)
         # The sharp color and the reference must not share their noise.

@@ -6,10 +6,10 @@ import itertools
 from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, BeforeValidator, Field, field_validator, model_validator
-from pydantic_core import PydanticCustomError
 
 from torchblur.frame import LONGEST_SHUTTER, Shutter, ShutterPosition
 from torchblur.params import Config
+from tuning.framing_config import Framed, read_size, refusal
 
 __all__ = [
     "Crops",
@@ -46,22 +46,19 @@ class _Exposed(Config):
         return Shutter(self.shutter, self.shutter_position)
 
 
-class _Sized(Config):
-    size: str = Field("320x180", description="WIDTHxHEIGHT in px")
+class _Sized(Framed):
+    size: str = Field("320x180", description="WIDTHxHEIGHT in px; with `of`: of the window")
 
     @field_validator("size")
     @classmethod
     def _is_size(cls, value: str) -> str:
-        parts = value.split("x")
-        if len(parts) != 2 or not all(p.isdigit() and int(p) > 0 for p in parts):
-            raise _refusal(f"`size` must be WIDTHxHEIGHT in px, got {value!r}")
+        read_size(value, "size")
         return value
 
     @property
     def height_width(self) -> tuple[int, int]:
         """Height and width in px."""
-        width, height = (int(part) for part in self.size.split("x"))
-        return height, width
+        return read_size(self.size, "size")
 
 
 class _Rendered(_Sized, _Exposed, _Weighted):
@@ -122,21 +119,17 @@ def _numbers(value: Any) -> Any:
     if not isinstance(value, dict):
         return value
     if set(value) != {"start", "stop"} or not all(type(v) is int for v in value.values()):
-        raise _refusal(f"`frames` must be a list or {{start: 0, stop: 8}}, got {value}")
+        raise refusal(f"`frames` must be a list or {{start: 0, stop: 8}}, got {value}")
     if value["stop"] <= value["start"]:
-        raise _refusal(f"`start < stop` must hold, got {value['start']} and {value['stop']}")
+        raise refusal(f"`start < stop` must hold, got {value['start']} and {value['stop']}")
     return tuple(range(value["start"], value["stop"]))
 
 
 def _rising(value: tuple[int, ...]) -> tuple[int, ...]:
     for before, after in itertools.pairwise(value):
         if after <= before:
-            raise _refusal(f"the frames of a sequence must rise, got {before} before {after}")
+            raise refusal(f"the frames of a sequence must rise, got {before} before {after}")
     return value
-
-
-def _refusal(text: str) -> PydanticCustomError:
-    return PydanticCustomError("nested", "{text}", {"text": text})
 
 
 _Numbers = Annotated[
@@ -217,7 +210,7 @@ class ExrStreamData(_Stream):
         names = value if isinstance(value, tuple) else (value,)
         for name in names:
             if isinstance(name, str) and "#" not in name:
-                raise _refusal(f"a sequence needs #### for the frame number, got {name!r}")
+                raise refusal(f"a sequence needs #### for the frame number, got {name!r}")
         return value
 
 
@@ -269,7 +262,7 @@ class DataSpec(Config):
         for index, item in _families(self.train):
             for other, twin in held:
                 if item.seed < twin.seeds.stop and twin.seed < item.seeds.stop:
-                    raise _refusal(
+                    raise refusal(
                         "scenes of one seed are alike, so the seeds of families in `train` and "
                         f"`holdout` must differ: train.{index} has {_seeds(item)}, "
                         f"holdout.{other} has {_seeds(twin)}"
@@ -280,7 +273,7 @@ class DataSpec(Config):
     def _holdout_is_not_weighted(self) -> DataSpec:
         for index, item in enumerate(self.holdout):
             if item.weight is not None:
-                raise _refusal(
+                raise refusal(
                     "`weight` counts in the fit, and hold-out figures are plain means over "
                     f"frames; got {item.weight:g} in holdout.{index}"
                 )

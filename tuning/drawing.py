@@ -33,6 +33,8 @@ def drawn_scenes(
     """
     family = load_family(path)
     common = item.model_dump(exclude={"kind", "scenes", "seed"})
+    if item.of is not None and item.at is None:
+        common["at"] = "motion"  # its scenes differ in where anything is
     for seed in item.seeds:
         one: SceneData | SceneStreamData
         if isinstance(item, FamilyData):

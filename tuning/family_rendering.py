@@ -87,6 +87,8 @@ def render_family(
         OutputError: files with other content are in the way, or the folder cannot be written to.
     """
     family = load_family(path)
+    if settings.of is not None and settings.at is None:
+        settings = settings.model_copy(update={"at": "motion"})
     files: list[Path] = []
     for seed in range(settings.seed, settings.seed + scenes):
         name = drawn_name(path, seed)

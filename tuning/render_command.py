@@ -27,6 +27,18 @@ def render(  # noqa: PLR0913 - each argument is an option
         Path, typer.Option("-o", "--output", metavar="DIR", help="Folder for the files.")
     ],
     size: Annotated[str, typer.Option(metavar="WxH", help="Size in px.")] = "640x360",
+    of: Annotated[
+        str | None,
+        typer.Option(metavar="WxH", help="Render a window of an image of this size, in px."),
+    ] = None,
+    at: Annotated[
+        str | None,
+        typer.Option(
+            metavar="X,Y",
+            help="Middle of the window, in shares of that image, or motion: where most moves. "
+            "Default: 0.5,0.5; of a family: motion.",
+        ),
+    ] = None,
     spp: Annotated[int, typer.Option(metavar="N", help="Samples per pixel of references.")] = 256,
     frames: Annotated[int, typer.Option(metavar="N", help="Number of frames.")] = 1,
     shutter: Annotated[
@@ -67,6 +79,8 @@ def render(  # noqa: PLR0913 - each argument is an option
 
     settings = settings_of(
         size,
+        of=of,
+        at=at,
         spp=spp,
         frames=frames,
         start=start,

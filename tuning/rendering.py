@@ -14,8 +14,10 @@ from pydantic import Field
 from torchblur.errors import ConfigError, OutputError, nearest_name
 from torchblur.frame import LONGEST_SHUTTER, Shutter, ShutterPosition
 from torchblur.io import write_frame, write_image
-from torchblur.params import Config, build
+from torchblur.params import build
 from torchblur.render import Renderer, Scene, load_scene
+from tuning.framing import find_box, seen_through, view_of
+from tuning.framing_config import Framed
 from tuning.outputs import made_by, make_folders, remove_leftovers, state_of
 from tuning.progress import Progress, Stage
 
@@ -24,7 +26,7 @@ __all__ = ["RenderSettings", "find_scene", "render_sequence", "settings_of"]
 _ROOTS = (Path(), Path(__file__).resolve().parents[1])
 
 
-class RenderSettings(Config):
+class RenderSettings(Framed):
     """How a scene is rendered."""
 
     width: int = Field(640, ge=1, le=16384, description="px")
@@ -42,6 +44,16 @@ class RenderSettings(Config):
     point_sampled: bool = Field(
         False, description="also render references of pixel centers, as streams are"
     )
+
+    @property
+    def height_width(self) -> tuple[int, int]:
+        """Height and width in px."""
+        return self.height, self.width
+
+    @property
+    def exposure(self) -> Shutter:
+        """The shutter of the reference."""
+        return Shutter(self.shutter, self.shutter_position)
 
 
 @dataclass(frozen=True)
@@ -103,6 +115,9 @@ def render_sequence(
     `reference_pointsampled.####.exr`, and a stream: `stream.####.exr` for one sample per pixel,
     `stream01.####.exr`, `stream02.####.exr` … for several, with `time` and `albedo`.
 
+    A window of a larger image (`settings.of`) is the same in all frames; where motion decides its
+    place, that is the motion in the first one.
+
     Args:
         path: File of the scene; its stem is NAME.
         folder: Where to.
@@ -118,7 +133,8 @@ def render_sequence(
         OutputError: files with other content are in the way, or the folder cannot be written to.
     """
     scene = load_scene(path)
-    tasks = _tasks(path, scene, folder, settings)
+    box = find_box(scene, settings, settings.start, settings.exposure)
+    tasks = _tasks(path, scene, folder, settings, view_of(settings, box))
     states = {task.path: state_of(task.path, (), task.recipe) for task in tasks}
     other = [file for file, state in states.items() if state == "other"]
     if other and not overwrite:
@@ -131,18 +147,22 @@ def render_sequence(
     remove_leftovers([task.path for task in todo])
     stage = Stage("render", len(todo), progress)
     stage.step(0)
-    renderer = Renderer(scene, images=settings.frames)
+    renderer = Renderer(seen_through(scene, settings, box), images=settings.frames)
     for done, task in enumerate(todo, start=1):
         _render(task, renderer, settings, made_by(task.recipe, path))
         stage.step(done, message=task.path.name)
     return [task.path for task in tasks]
 
 
-def _tasks(path: Path, scene: Scene, folder: Path, settings: RenderSettings) -> list[_Task]:
+def _tasks(
+    path: Path, scene: Scene, folder: Path, settings: RenderSettings, view: str
+) -> list[_Task]:
     digest = hashlib.sha256(scene.model_dump_json().encode()).hexdigest()[:16]
     # What does not change a file is not in its recipe, nor are settings that came later.
-    others = {"frames", "start", "stream_spp", "point_sampled"}
+    others = {"frames", "start", "stream_spp", "point_sampled", "of", "at"}
     common = {"scene": digest} | settings.model_dump(mode="json", exclude=others)
+    if view:
+        common["window"] = view
     return [
         _Task(
             kind=kind,
@@ -169,9 +189,8 @@ def _kinds(settings: RenderSettings) -> Iterator[tuple[str, int, str]]:
 def _render(
     task: _Task, renderer: Renderer, settings: RenderSettings, metadata: Mapping[str, Any]
 ) -> None:
-    size = (settings.height, settings.width)
+    size, shutter = settings.height_width, settings.exposure
     time, seed = settings.start + task.number, settings.seed + task.number
-    shutter = Shutter(settings.shutter, settings.shutter_position)
     if task.kind == "frame":
         frame = renderer.frame(size, frame=time, color_spp=settings.color_spp, seed=seed)
         write_frame(task.path, frame, metadata=metadata, overwrite=True)

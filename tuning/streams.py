@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import hashlib
 import itertools
 from collections.abc import Iterable
@@ -19,6 +20,7 @@ from torchblur.render import Scene, render_frame, render_reference, render_strea
 from tuning.cases import SequenceCase
 from tuning.data_config import ExrStreamData, SceneStreamData
 from tuning.frame_cache import cache_key, cached, frame_of, planes_of
+from tuning.framing import cached_box, seen_through, view_of
 from tuning.numbering import numbered_file
 
 __all__ = ["ExrStreamJob", "SceneStreamJob", "shot_starts"]
@@ -41,7 +43,7 @@ class SceneStreamJob:
     @property
     def name(self) -> str:
         """Name of the case: scene and frame numbers."""
-        return f"{self.stem} {_span(self.item.frames)}"
+        return f"{self.stem} {_span(self.item.frames)}{self.item.suffix}"
 
     def load(self, split: str) -> SequenceCase:
         """Render the frames that the cache does not have.
@@ -50,11 +52,10 @@ class SceneStreamJob:
             ConfigError: a cut that is no frame.
         """
         item, scene_key = self.item, self.scene.fingerprint()
-        settings = item.model_dump(exclude={"path", "frames", "cuts", "warm_up", "weight"})
-        kept = [
-            cached(cache_key(scene_key, settings, float(n)), lambda n=n: self._render(float(n)))  # type: ignore[misc]
-            for n in item.frames
-        ]
+        middle = float(item.frames[len(item.frames) // 2])
+        box = cached_box(self.scene, item, middle, item.exposure)
+        scene = seen_through(self.scene, item, box)
+        kept = self._kept(scene)
         sources = [f"{self.stem} {number}" for number in item.frames]
         cuts = shot_starts(item.frames, item.cuts, self.name)
         sharp = [frame_of(t, "sharp", s) for t, s in zip(kept, sources, strict=True)]
@@ -75,11 +76,24 @@ class SceneStreamJob:
             warm_up=_warm_up(item.warm_up, len(kept), self.name),
             identities=tuple(f"{scene_key} {float(number)}" for number in item.frames),
             origin=scene_key,
+            view=view_of(item, box),
             seed=item.seed,
         )
 
-    def _render(self, time: float) -> dict[str, Tensor]:
-        item, scene = self.item, self.scene
+    def _kept(self, scene: Scene) -> list[dict[str, Tensor]]:
+        """Return what the cache has of all frames, or is given now."""
+        apart = {"path", "frames", "cuts", "warm_up", "weight", "of", "at"}
+        settings, scene_key = self.item.model_dump(exclude=apart), scene.fingerprint()
+        return [
+            cached(
+                cache_key(scene_key, settings, float(number)),
+                functools.partial(self._render, scene, float(number)),
+            )
+            for number in self.item.frames
+        ]
+
+    def _render(self, scene: Scene, time: float) -> dict[str, Tensor]:
+        item = self.item
         size, shutter = item.height_width, item.exposure
         stream = render_stream(
             scene, size, frame=time, shutter=shutter, spp=item.stream_spp, seed=item.seed

@@ -7,12 +7,13 @@ x to the right and y down, and pixel (x, y) has its center at (x + 1/2, y + 1/2)
 from __future__ import annotations
 
 import math
-from typing import Annotated
+from typing import Annotated, Any
 
 import torch
-from pydantic import Field, model_validator
+from pydantic import Field, SerializerFunctionWrapHandler, model_serializer, model_validator
 from torch import Tensor
 
+from torchblur.errors import ConfigError
 from torchblur.render.motion import Level, Number, Placed, Triple, into, place, turn
 from torchblur.render.vectors import Vec
 
@@ -29,7 +30,9 @@ class Camera(Placed):
         (0.0, 1.0, 0.0), description="axis of the spin, in the world; any length but 0"
     )
     look_at: Triple | None = Field(
-        None, description="world point in the middle of the image at frame 0; instead of `rotation`"
+        None,
+        description="world point in the middle of the image (without `shift`) at frame 0; instead "
+        "of `rotation`",
     )
     up: Triple = Field((0.0, 1.0, 0.0), description="what is up in the image, with `look_at`")
     fov: Annotated[Number, Field(gt=0, lt=180)] | None = Field(
@@ -37,6 +40,12 @@ class Camera(Placed):
     )
     focal: Annotated[Number, Field(gt=0)] | None = Field(
         None, description="focal length over the image's width; instead of `fov`"
+    )
+    shift: tuple[Number, Number] = Field(
+        (0.0, 0.0),
+        description="how far the image's middle lies to the right of and below the view axis, "
+        "over the image's width; perspective stays. Blender's Shift X, and its Shift Y with the "
+        "other sign, where the image is not higher than wide",
     )
 
     @model_validator(mode="after")
@@ -55,12 +64,38 @@ class Camera(Placed):
             )
         return self
 
+    @model_serializer(mode="wrap")
+    def _without_no_shift(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        """Leave out a shift of 0: scenes are known by this, and were so before it was there."""
+        data: dict[str, Any] = handler(self)
+        if not any(self.shift):
+            data.pop("shift", None)
+        return data
+
     @property
     def focal_over_width(self) -> float:
         """Focal length over the image's width."""
         if self.focal is not None:
             return self.focal
         return 0.5 / math.tan(math.radians(50.0 if self.fov is None else self.fov) / 2)
+
+    def window(self, *, of: tuple[int, int], box: tuple[int, int, int, int]) -> Camera:
+        """Return the camera whose image is a window of this one's: equal pixels, in their place.
+
+        Args:
+            of: Height and width of this camera's image, px, each at least 1.
+            box: Top, left, height and width of the window, px; the last two at least 1. It may
+                reach beyond the image.
+
+        Raises:
+            ConfigError: a size below 1.
+        """
+        top, left, height, width = box
+        if min(*of, height, width) < 1:
+            raise ConfigError(f"sizes must be at least 1 px, got `of` {of} and `box` {box}")
+        across, down, focal = lens(self, of).tolist()
+        shift = ((width / 2 - (across - left)) / width, (height / 2 - (down - top)) / width)
+        return self.model_copy(update={"fov": None, "focal": focal / width, "shift": shift})
 
     def level(self) -> Level:
         """Return the motion from camera space (looking along -z) to the world."""
@@ -75,14 +110,15 @@ class Camera(Placed):
 
 
 def lens(camera: Camera, size: tuple[int, int]) -> Tensor:
-    """Return half width, half height and focal length in px, float64, (3,).
+    """Return x and y of the view axis in the image, and focal length, px, float64, (3,).
 
     Args:
         camera: The camera; pixels are square, and its field of view is that of the width.
         size: Height and width in px.
     """
     height, width = size
-    numbers = (width / 2, height / 2, camera.focal_over_width * width)
+    right, down = (width * share for share in camera.shift)
+    numbers = (width / 2 - right, height / 2 - down, camera.focal_over_width * width)
     return torch.tensor(numbers, dtype=torch.float64)
 
 
@@ -102,9 +138,9 @@ def camera_rays(
         Origins and directions. A direction is 1 long along the view axis, so that the parameter
         of a hit is its depth.
     """
-    half_width, half_height, focal = lens.unbind(0)
+    across, down, focal = lens.unbind(0)
     zero = torch.zeros_like(x)
-    direction = ((x - half_width) / focal, (half_height - y) / focal, zero - 1)
+    direction = ((x - across) / focal, (down - y) / focal, zero - 1)
     return place(levels, time, (zero, zero, zero)), turn(levels, time, direction)
 
 
@@ -124,10 +160,10 @@ def project(
     Returns:
         x and y in px, (N,) each. Differentiable: in time, point and direction.
     """
-    half_width, half_height, focal = lens.unbind(0)
+    across, down, focal = lens.unbind(0)
     near, far = into(levels, time, point, direction)
     x, y, z = (torch.where(is_sky, b, a) for a, b in zip(near, far, strict=True))
-    return half_width - focal * x / z, half_height + focal * y / z
+    return across - focal * x / z, down + focal * y / z
 
 
 def _vector(values: Triple) -> Tensor:

@@ -78,6 +78,18 @@ class Scene(Config):
             for found in _unfold(body, [], number)
         ]
 
+    def window(self, *, of: tuple[int, int], box: tuple[int, int, int, int]) -> Scene:
+        """Return the scene seen through a window of its camera's image.
+
+        Args:
+            of: As in `Camera.window`.
+            box: As in `Camera.window`.
+
+        Raises:
+            ConfigError: a size below 1.
+        """
+        return self.model_copy(update={"camera": self.camera.window(of=of, box=box)})
+
     def fingerprint(self) -> str:
         """Return a hash of what the scene says and what its files hold, wherever they lie.
 

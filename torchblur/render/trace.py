@@ -173,7 +173,7 @@ class Tracer:
         return torch.stack(chains, -1)[..., bodies.long()]
 
     def lens(self, size: tuple[int, int]) -> Tensor:
-        """Return half width, half height and focal length for an image size, px, (3,)."""
+        """Return x and y of the view axis, and focal length, for an image size, px, (3,)."""
         return lens(self.camera, size).to(self._device, self._dtype)
 
     def radiance(self, hit: Hit) -> Tensor:
