@@ -14,6 +14,7 @@ __all__ = [
     "FileFormatError",
     "FrameError",
     "OutputError",
+    "ReachWarning",
     "TorchblurError",
     "nearest_name",
 ]
@@ -37,6 +38,10 @@ class FileFormatError(TorchblurError):
 
 class OutputError(TorchblurError):
     """A result cannot be written where it should go, or one is there already."""
+
+
+class ReachWarning(UserWarning):
+    """A filter cuts motion short: part of a frame moves farther than it blurs."""
 
 
 def nearest_name(name: str, valid: Iterable[str]) -> str:

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from torchblur.filters.base import BlurFilter, Values
+from torchblur.filters.base import Values
 from torchblur.filters.composed_config import ComposedConfig
 from torchblur.filters.composed_gather import (
     TapOptions,
@@ -24,7 +24,7 @@ from torchblur.filters.moving import moving_pixels, packed_values, tile_planes
 from torchblur.filters.notes2025_gather import Blurred, Line, Sums, compose
 from torchblur.filters.notes2025_postfilter import post_filter
 from torchblur.filters.places import SHORTEST_REACH, num_pairs
-from torchblur.filters.reach import Gather, by_length, tap_counts
+from torchblur.filters.reach import Gather, ReachingBlur, by_length, tap_counts
 from torchblur.filters.reconstruction import color_from, resolve, texture_of
 from torchblur.filters.revealed import revealed_inputs
 from torchblur.filters.spreads import Spread
@@ -85,7 +85,7 @@ def composed(frame: Frame, config: ComposedConfig | None = None, **params: Any) 
     return result
 
 
-class ComposedBlur(BlurFilter):
+class ComposedBlur(ReachingBlur):
     """torchblur's own filter; the published ones are sets of its parameters. See `composed`.
 
     `layers` adds "alpha" (the front's share; with one sum the mean weight), "output_alpha" (how

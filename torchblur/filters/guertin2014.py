@@ -7,10 +7,10 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from torchblur.filters.base import BlurFilter, Values
+from torchblur.filters.base import Values
 from torchblur.filters.guertin2014_config import Guertin2014Config
 from torchblur.filters.moving import Filtered, Moving, Stray, moving_part, revealed_part
-from torchblur.filters.reach import by_length
+from torchblur.filters.reach import ReachingBlur, by_length
 from torchblur.filters.reconstruction import WEIGHT_PARAMETERS, Tap, is_one, resolve, sample
 from torchblur.filters.spreads import Spread, per_image, tiles_of
 from torchblur.frame import Frame, Shutter
@@ -85,7 +85,7 @@ def guertin2014(frame: Frame, config: Guertin2014Config | None = None, **params:
     return result
 
 
-class Guertin2014Blur(BlurFilter):
+class Guertin2014Blur(ReachingBlur):
     """The feature-aware filter of Guertin 2014. See `guertin2014` for the formula.
 
     `layers` adds "luma" for an anti-aliasing pass (B, 1, H, W), "tile_max" and "neighbor_max"

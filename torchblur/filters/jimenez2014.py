@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from torchblur.filters.base import BlurFilter, Values
+from torchblur.filters.base import Values
 from torchblur.filters.jimenez2014_config import Jimenez2014Config
 from torchblur.filters.moving import (
     Filtered,
@@ -18,7 +18,7 @@ from torchblur.filters.moving import (
     revealed_part,
 )
 from torchblur.filters.places import SHORTEST_REACH, num_pairs, tap_shift, tile_noise
-from torchblur.filters.reach import by_length, code_range
+from torchblur.filters.reach import ReachingBlur, by_length, code_range
 from torchblur.filters.reconstruction import Tap, sample
 from torchblur.filters.spreads import pixel_spread, tiles_of
 from torchblur.frame import Frame, Shutter
@@ -85,7 +85,7 @@ def jimenez2014(frame: Frame, config: Jimenez2014Config | None = None, **params:
     return result
 
 
-class Jimenez2014Blur(BlurFilter):
+class Jimenez2014Blur(ReachingBlur):
     """The filter of Jimenez 2014: tile classes, mirrored pairs of taps, center fill.
 
     See `jimenez2014` for the formula. `layers` adds "alpha" (the mean weight in [0, 1],

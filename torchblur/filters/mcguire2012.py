@@ -7,9 +7,9 @@ from typing import Annotated, Any, NamedTuple
 import torch
 from torch import Tensor
 
-from torchblur.filters.base import BlurFilter, Values
+from torchblur.filters.base import Values
 from torchblur.filters.moving import Filtered, Moving, moving_part, revealed_part
-from torchblur.filters.reach import by_length
+from torchblur.filters.reach import ReachingBlur, by_length
 from torchblur.filters.reconstruction import (
     WEIGHT_PARAMETERS,
     ReconstructionConfig,
@@ -105,7 +105,7 @@ def mcguire2012(frame: Frame, config: McGuire2012Config | None = None, **params:
     return result
 
 
-class McGuire2012Blur(BlurFilter):
+class McGuire2012Blur(ReachingBlur):
     """The tile-based filter of McGuire 2012: TileMax, NeighborMax, one gather. See `mcguire2012`.
 
     `layers` adds "tile_max" and "neighbor_max" (half spread in px, (B, 2, Ty, Tx)) and "weight"

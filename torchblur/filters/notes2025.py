@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from torchblur.configured import batch_size_of
-from torchblur.filters.base import BlurFilter, Values
+from torchblur.filters.base import Values
 from torchblur.filters.moving import moving_among, moving_pixels, packed_values, tile_planes
 from torchblur.filters.notes2025_config import Notes2025Config
 from torchblur.filters.notes2025_gather import (
@@ -22,7 +22,7 @@ from torchblur.filters.notes2025_gather import (
 )
 from torchblur.filters.notes2025_postfilter import post_filter
 from torchblur.filters.places import num_pairs
-from torchblur.filters.reach import code_range, longest_spread, tap_counts
+from torchblur.filters.reach import ReachingBlur, code_range, longest_spread, tap_counts
 from torchblur.filters.reconstruction import color_from
 from torchblur.filters.revealed import layer_behind, revealed_inputs
 from torchblur.filters.spreads import Spread, exact_spread, tile_motions
@@ -73,7 +73,7 @@ def notes2025(frame: Frame, config: Notes2025Config | None = None, **params: Any
     return result
 
 
-class Notes2025Blur(BlurFilter):
+class Notes2025Blur(ReachingBlur):
     """The filter of the 2025 notes; every section of the text is a switch. See `notes2025`.
 
     `layers` adds "alpha" (the foreground's) and "output_alpha" (how much of the result replaces

@@ -3,27 +3,34 @@
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Callable
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal, NamedTuple
 
 import torch
 from torch import Tensor
 
-from torchblur.filters.base import FilterConfig, Values
-from torchblur.frame import Shutter
+from torchblur.errors import ReachWarning
+from torchblur.filters.base import BlurFilter, FilterConfig, Values
+from torchblur.frame import Frame, Shutter
 from torchblur.ops.gather import Inputs
 from torchblur.ops.pixels import PixelList, select, takes_all_pixels
 from torchblur.params import Param
 
 __all__ = [
+    "Cut",
     "Gather",
     "ReachConfig",
+    "ReachingBlur",
     "by_length",
     "code_range",
     "longest_spread",
     "swept_times",
     "tap_counts",
 ]
+
+_WORTH_NAMING = 0.01  # share of the pixels
+_LONGER = 1.1  # how much longer than the reach a half spread must be to count as cut
 
 Sums = tuple[Tensor, ...]
 Gather = Callable[[int, Inputs, PixelList], Sums]
@@ -52,6 +59,68 @@ class ReachConfig(FilterConfig):
         meaning="tap_spacing: most taps of a path",
     )] = 128
 # fmt: on
+
+
+class Cut(NamedTuple):
+    """How much of a frame moves farther than a filter blurs."""
+
+    share: float
+    """Share of the pixels whose half spread is more than a tenth longer than the reach."""
+    longest: float
+    """Longest half spread in the frame, px."""
+    reach: float
+    """Longest half spread that is blurred, px."""
+
+
+class ReachingBlur(BlurFilter):
+    """A filter that blurs only so far; where that cuts motion short it says so, once."""
+
+    _cut_told = False
+
+    def cut(self, frame: Frame, **overrides: Any) -> Cut:
+        """Return how much of a frame moves farther than the filter blurs.
+
+        Args:
+            frame: One frame or a batch; only its velocity counts.
+            **overrides: Values of parameters, as in a call.
+        """
+        frame, values = super()._prepared(frame, overrides)
+        return _cut(frame, values)
+
+    def _prepared(self, frame: Frame, overrides: dict[str, Any]) -> tuple[Frame, Values]:
+        frame, values = super()._prepared(frame, overrides)
+        if not self._cut_told and not takes_all_pixels():
+            cut = _cut(frame, values)
+            if cut.share >= _WORTH_NAMING:
+                self._cut_told = True
+                warnings.warn(self._advice(cut), ReachWarning, stacklevel=5)
+        return frame, values
+
+    def _advice(self, cut: Cut) -> str:
+        config = self.config
+        assert isinstance(config, ReachConfig)
+        if config.reach == "frame":
+            advice = f"raise `max_reach`, now {config.max_reach:g} px"
+        else:
+            tile = getattr(config, "tile_size", None)
+            advice = f'give reach="frame", or a larger `tile_size`, now {tile} px'
+        return (
+            f"{self.name}: {cut.share:.0%} of the pixels move farther than the {cut.reach:g} px to "
+            f"each side that it blurs, up to {cut.longest:.0f} px, and are cut there; {advice}"
+        )
+
+
+@torch.no_grad()
+def _cut(frame: Frame, values: Values) -> Cut:
+    reach, half_open = longest_spread(values), values.shutter * 0.5
+    size = frame.velocity.square().sum(1, keepdim=True).sqrt_()
+    if half_open.ndim == 4:
+        size = size * half_open
+    longest = float(size.amax()) * (1.0 if half_open.ndim == 4 else float(half_open))
+    if longest <= _LONGER * reach:
+        return Cut(0.0, longest, reach)
+    least = _LONGER * reach * float(size.amax()) / longest
+    return Cut(float((size > least).to(frame.dtype).mean()), longest, reach)
 
 
 def longest_spread(values: Values) -> float:

@@ -7,8 +7,8 @@ from typing import Annotated, Any, Literal, NamedTuple
 import torch
 from torch import Tensor
 
-from torchblur.filters.base import BlurFilter, Values
-from torchblur.filters.reach import by_length, longest_spread
+from torchblur.filters.base import Values
+from torchblur.filters.reach import ReachingBlur, by_length, longest_spread
 from torchblur.filters.reconstruction import (
     WEIGHT_PARAMETERS,
     ReconstructionConfig,
@@ -147,7 +147,7 @@ def sousa2013(frame: Frame, config: Sousa2013Config | None = None, **params: Any
     return result
 
 
-class Sousa2013Blur(BlurFilter):
+class Sousa2013Blur(ReachingBlur):
     """The filter of Sousa 2013: McGuire's with a wider, linear cylinder, in two passes.
 
     See `sousa2013` for the formula. `layers` adds "first_pass" (the color after one pass,

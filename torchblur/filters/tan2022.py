@@ -8,8 +8,8 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from torchblur.filters.base import BlurFilter, Values
-from torchblur.filters.reach import by_length
+from torchblur.filters.base import Values
+from torchblur.filters.reach import ReachingBlur, by_length
 from torchblur.filters.reconstruction import (
     WEIGHT_PARAMETERS,
     Tap,
@@ -105,7 +105,7 @@ def tan2022(frame: Frame, config: Tan2022Config | None = None, **params: Any) ->
     return result
 
 
-class Tan2022Blur(BlurFilter):
+class Tan2022Blur(ReachingBlur):
     """The hybrid filter of Tan 2022. See `tan2022` for the formula.
 
     It warns once of each layer that it does without. `layers` adds "ray_mask" (where a renderer
