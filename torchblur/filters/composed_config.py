@@ -121,12 +121,12 @@ class ComposedConfig(RevealedBackgroundConfig, ReconstructionConfig):
     tile_size: Annotated[int, Param(
         symbol="r", unit="px", low=1, high=512, scale="log", grad="discrete", source=_OURS,
         meaning="edge of a tile: small ones keep motions apart, whatever the reach",
-    )] = 10
+    )] = 8
     tap_spacing: Annotated[float, Param(
         unit="px", low=0.0, high=64.0, grad="discrete", source=_OURS,
         meaning="largest distance between neighboring taps of a path: where num_samples would "
                 "leave more there are more taps, up to max_samples; 0: num_samples everywhere",
-    )] = 4.0
+    )] = 3.0
     neighbor_culling: Annotated[bool, Param(
         grad="discrete", source=f"{_GUERTIN}, section 4.4",
         meaning="a diagonal tile counts only if its motion can reach the middle one",
