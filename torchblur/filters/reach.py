@@ -226,7 +226,7 @@ def tap_counts(values: Values, reach: Tensor, least: int) -> Tensor:
 
 def _classes(values: Values, reach: Tensor, least: int) -> list[tuple[int, Tensor | None]]:
     """Return numbers of taps, and which pixels take so many; None: all."""
-    if values.tap_spacing <= 0 or takes_all_pixels():
+    if values.tap_spacing <= 0 or takes_all_pixels() or reach.numel() == 0:
         return [(least, None)]
     counts = tap_counts(values, reach, least).amax(0).flatten()
     found = counts.unique().int().tolist()

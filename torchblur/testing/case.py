@@ -15,6 +15,14 @@ from torchblur.testing.frames import as_stream
 
 __all__ = ["FilterCase"]
 
+_LONG_PATHS = {"tile_size": 100, "shutter": 8.0, "num_samples": 2}
+_REACH = {
+    "reach": {"tile_size": 2},
+    "tap_spacing": _LONG_PATHS,
+    "max_samples": _LONG_PATHS | {"tap_spacing": 0.5},
+}
+"""Under what the parameters of the reach act, in filters that have it."""
+
 
 class FilterCase:
     """What the contract needs to know of a filter, and how it runs it."""
@@ -35,6 +43,14 @@ class FilterCase:
     def blur(self, **params: Any) -> BlurFilter:
         """Return the filter with its `plain` parameters and some others."""
         return self.filter_class(**(self.plain | params))
+
+    def __init_subclass__(cls, **kwargs: Any) -> None:
+        super().__init_subclass__(**kwargs)
+        if "filter_class" in cls.__dict__ and "max_reach" in declared(
+            cls.filter_class.config_class
+        ):
+            cls.acts_with = _REACH | cls.acts_with
+            cls.inert = (*cls.inert, "max_reach")  # no motion of the frames here is as long
 
     # -- hooks for filters that need more than color, velocity and depth -----------------------
 

@@ -1,0 +1,234 @@
+import warnings
+
+import pytest
+import torch
+
+from torchblur.errors import ReachWarning
+from torchblur.filters import get_filter
+from torchblur.filters import reach as reach_module
+from torchblur.filters.base import Values
+from torchblur.filters.reach import tap_counts
+from torchblur.frame import Frame
+from torchblur.ops import gather as gather_module
+from torchblur.testing.frames import constant_motion, random_frame
+from torchblur.testing.probes import box_blur
+
+REACHING = (
+    "guertin2014",
+    "jimenez2014",
+    "mcguire2012",
+    "notes2025",
+    "sousa2013",
+    "tan2022",
+    "torchblur",
+)
+POSITIONS = ("centered", "leading", "trailing")
+
+
+def make(name, **params):
+    blur = get_filter(name)(**params)
+    if name == "tan2022":
+        blur._told = {"normal", "object_id", "revealed"}
+    return blur
+
+
+def passing(speed=240.0, height=24, width=400):
+    """A white bar, 40 px wide, that flies over a dark still ground."""
+    inside = torch.zeros(1, 1, height, width, dtype=torch.bool)
+    inside[..., 180:220] = True
+    velocity = torch.zeros(1, 2, height, width)
+    velocity[:, :1] = torch.where(inside, speed, 0.0)
+    return Frame(
+        color=inside.expand(1, 3, -1, -1).float(),
+        velocity=velocity,
+        depth=torch.where(inside, 1.0, 9.0),
+    )
+
+
+@pytest.mark.parametrize("position", POSITIONS)
+@pytest.mark.parametrize("name", REACHING)
+def test_uniform_motion_longer_than_a_tile_is_a_box_blur(name, position):
+    frame = constant_motion((160.0, 0.0), 8, 400)
+    blur = make(
+        name,
+        shutter_position=position,
+        reach="frame",
+        tile_size=10,
+        tap_spacing=1.0,
+        max_samples=1024,
+        noise="none",
+    )
+    blurred = blur(frame).detach()
+    shift = {"centered": 0.0, "leading": 40.0, "trailing": -40.0}[position]
+    expected = box_blur(frame.color, 80.0, shift)
+    inner = slice(120, -120)
+    error = float((blurred - expected)[..., inner].abs().mean())
+    unblurred = float((frame.color - expected)[..., inner].abs().mean())
+    assert error < 0.25 * unblurred
+
+
+@pytest.mark.parametrize("position", POSITIONS)
+@pytest.mark.parametrize("name", REACHING)
+def test_what_flies_past_reaches_as_far_as_it_moves(name, position):
+    frame = passing()  # half spread 60 px; tiles of 10
+    blur = make(name, shutter_position=position, tile_size=10, tap_spacing=4.0, noise="none")
+    blurred = make(name, **(blur.config.model_dump() | {"reach": "frame"}))(frame).detach()
+    row = (blurred[0, 0, 12] > 0.02).nonzero()[:, 0]
+    center = {"centered": 0, "leading": 60, "trailing": -60}[position]
+    assert abs(int(row.min()) - (180 - 60 + center)) <= 16
+    assert abs(int(row.max()) - (219 + 60 + center)) <= 16
+    with pytest.warns(ReachWarning):
+        cut = make(name, **(blur.config.model_dump() | {"reach": "tile"}))(frame).detach()
+    short = (cut[0, 0, 12] > 0.02).nonzero()[:, 0]
+    assert int(short.max() - short.min()) <= 40 + 2 * 10 + 2
+
+
+@pytest.mark.parametrize("name", REACHING)
+def test_max_reach_cuts(name):
+    frame = passing()
+    blur = make(name, reach="frame", max_reach=30.0, tile_size=10, noise="none")
+    with pytest.warns(ReachWarning, match=r"up to 60 px, .*raise `max_reach`, now 30 px"):
+        blurred = blur(frame, shutter_position="centered").detach()
+    row = (blurred[0, 0, 12] > 0.02).nonzero()[:, 0]
+    assert 40 + 2 * 20 < int(row.max() - row.min()) <= 40 + 2 * 30 + 2
+
+
+@pytest.mark.parametrize("name", REACHING)
+def test_batch_of_slow_and_fast_frames_equals_single_runs(name):
+    frames = [random_frame(40, 48, speed=speed, seed=seed) for seed, speed in enumerate((4, 120))]
+    blur = make(name, reach="frame", tile_size=6, tap_spacing=3.0)
+    single = torch.cat([blur(frame) for frame in frames])
+    assert torch.allclose(blur(Frame.stack(frames)), single, atol=1e-5)
+
+
+@pytest.mark.parametrize("name", REACHING)
+def test_only_the_moving_part_costs_and_counts(name):
+    # A long blur in a corner of a wide still frame: as if all pixels were done.
+    frame = passing(width=400)
+    wide = Frame(
+        **{
+            key: torch.nn.functional.pad(
+                plane.float(), (0, 1200, 0, 0), value=9.0 * (key == "depth")
+            )
+            for key, plane in frame.layers().items()
+        }
+    )
+    blur = make(name, reach="frame", tile_size=10, shutter_position="centered", noise="none")
+    with torch.no_grad():
+        narrow, image = blur(frame), blur(wide)
+    assert torch.allclose(image[..., :300], narrow[..., :300], atol=1e-5)
+    assert torch.equal(image[..., 400:], wide.color[..., 400:])
+
+
+# -- taps ------------------------------------------------------------------------------------------
+
+
+def values(**changed):
+    base = {"tap_spacing": 3.0, "num_samples": 16, "max_samples": 128}
+    return Values(**(base | changed))
+
+
+def test_neighboring_taps_are_as_close_as_promised():
+    reach = torch.linspace(0, 300, 997).view(1, 1, 1, -1)
+    counts = tap_counts(values(), reach, 16)
+    assert float(counts.min()) == 16
+    assert float(counts.max()) == 128
+    gap = 2 * reach / counts
+    assert float(gap[counts < 128].max()) <= 3.0 + 1e-4
+    # No more than the next step of the square root of 2 beyond what is needed.
+    needed = (2 * reach / 3.0).clamp(16, 128)
+    assert float((counts / needed).max()) < 1.5
+
+
+def test_pairs_have_half_as_many():
+    reach = torch.linspace(0, 300, 97).view(1, 1, 1, -1)
+    counts = tap_counts(values(), reach, 8)
+    assert float(counts.max()) == 64
+    assert float((2 * reach / (2 * counts))[counts < 64].max()) <= 3.0 + 1e-4
+
+
+@pytest.mark.parametrize("name", REACHING)
+def test_only_long_paths_take_more_taps(monkeypatch, name):
+    taken = []
+    original = gather_module.sum_taps
+
+    def counting(tap, options, num_samples, inputs, *args, lists, **kwargs):
+        taken.append((num_samples, lists.num_pixels))
+        return original(tap, options, num_samples, inputs, *args, lists=lists, **kwargs)
+
+    monkeypatch.setattr(gather_module, "sum_taps", counting)
+    settings = {"reach": "frame", "tile_size": 10, "num_samples": 8, "noise": "none"}
+    slow, fast = passing(16.0), passing(240.0)
+    with torch.no_grad():
+        for spacing in (0.0, 2.0):
+            make(name, tap_spacing=spacing, **settings)(slow)
+            taken.append(None)
+        middle = taken.index(None)
+        assert taken[:middle] == taken[middle + 1 : -1]  # 4 px of path: the same work
+        taken.clear()
+        make(name, tap_spacing=2.0, **settings)(fast)
+        assert max(number for number, _ in taken) >= 30
+
+
+def test_a_streak_of_a_bright_point_has_no_beads():
+    frame = passing()
+    point = torch.zeros(1, 1, 24, 400, dtype=torch.bool)
+    point[..., 11:14, 199:202] = True
+    velocity = torch.zeros(1, 2, 24, 400)
+    velocity[:, :1] = torch.where(point, 200.0, 0.0)
+    frame = Frame(
+        color=torch.where(point, 50.0, 0.1).expand(1, 3, -1, -1),
+        velocity=velocity,
+        depth=torch.where(point, 1.0, 9.0),
+    )
+    blurred = get_filter("torchblur")()(frame).detach()[0, 0, 12, 160:241]
+    sparse = get_filter("torchblur")(tap_spacing=0.0)(frame).detach()[0, 0, 12, 160:241]
+    # The exact streak has 3 px of 50 over 100 px, and the ground.
+    exact = 0.1 + (50 - 0.1) * 3 / 100
+    assert float((blurred - exact).abs().mean()) < 0.4 * exact
+    assert float(blurred.std()) < 0.5 * float(sparse.std())
+
+
+# -- the warning -----------------------------------------------------------------------------------
+
+
+def test_a_cut_is_told_once_with_its_figures():
+    frame = passing()  # 10 % of the pixels move, 60 px to each side
+    blur = get_filter("guertin2014")(tile_size=20)
+    with pytest.warns(ReachWarning) as told:
+        blur(frame)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        blur(frame)
+    assert len(told) == 1
+    assert str(told[0].message) == (
+        "guertin2014: 10% of the pixels move farther than the 20 px to each side that it blurs, up "
+        'to 60 px, and are cut there; give reach="frame", or a larger `tile_size`, now 20 px'
+    )
+    assert told[0].filename == __file__
+
+
+@pytest.mark.parametrize("params", [{"reach": "frame"}, {"tile_size": 60}, {"shutter": 0.1}])
+def test_what_is_not_cut_is_not_told(params):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        get_filter("guertin2014")(**({"tile_size": 20} | params))(passing())
+
+
+def test_cut_counts_pixels_at_the_shutter_of_the_call():
+    blur = get_filter("mcguire2012")(tile_size=20)
+    frame = passing()
+    assert blur.cut(frame).share == pytest.approx(0.1)
+    assert blur.cut(frame)[1:] == pytest.approx((60.0, 20.0))
+    assert blur.cut(frame, shutter=0.1).share == 0.0
+    two = blur.cut(frame, shutter=torch.tensor([0.1, 0.5]).view(2, 1, 1, 1))
+    assert two.share == pytest.approx(0.05)
+    # With a shutter that is not centered the taps reach twice as far, so the limit is half a tile.
+    assert blur.cut(frame, shutter_position="leading").reach == 10.0
+
+
+def test_few_pixels_are_not_worth_a_warning(monkeypatch):
+    monkeypatch.setattr(reach_module, "_WORTH_NAMING", 0.11)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        get_filter("guertin2014")(tile_size=20)(passing())
