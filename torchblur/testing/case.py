@@ -15,8 +15,8 @@ from torchblur.testing.frames import as_stream
 
 __all__ = ["FilterCase"]
 
-_LONG_PATHS = {"tile_size": 100, "shutter": 8.0, "num_samples": 2}
-_REACH = {
+_LONG_PATHS: dict[str, Any] = {"tile_size": 100, "shutter": 8.0, "num_samples": 2}
+_REACH: dict[str, dict[str, Any]] = {
     "reach": {"tile_size": 2},
     "tap_spacing": _LONG_PATHS,
     "max_samples": _LONG_PATHS | {"tap_spacing": 0.5},
