@@ -122,6 +122,10 @@ class ComposedConfig(RevealedBackgroundConfig, ReconstructionConfig):
         symbol="r", unit="px", low=1, high=512, scale="log", grad="discrete", source=_OURS,
         meaning="edge of a tile: small ones keep motions apart, whatever the reach",
     )] = 8
+    early_out: Annotated[float, Param(
+        unit="px", low=0.0, high=4.0, grad="weak", source=f"1/2: McGuire 2012; 1/4: {_OURS}",
+        meaning="a pixel is left as it is where the tile's half spread is not above this",
+    )] = 0.25
     tap_spacing: Annotated[float, Param(
         unit="px", low=0.0, high=64.0, grad="discrete", source=_OURS,
         meaning="largest distance between neighboring taps of a path: where num_samples would "
