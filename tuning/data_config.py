@@ -228,7 +228,8 @@ class Crops(Config):
     context: int | None = Field(
         None,
         ge=0,
-        description="px around it that are filtered and not scored; twice the tile if left out",
+        description="px around it that are filtered and not scored; if left out twice the tile, or "
+        "with `reach: frame` the longest blur to each side and a tile",
     )
     choose: Literal["motion", "error"] = Field(
         "motion",

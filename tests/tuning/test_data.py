@@ -11,6 +11,8 @@ from planted import planted_case, tiny_frame
 
 import tuning.data
 from torchblur.errors import ConfigError, FileFormatError
+from torchblur.filters import get_filter
+from torchblur.frame import Shutter
 from torchblur.io import write_frame, write_image
 from torchblur.params import build
 from tuning.data import cache_folder, load_cases
@@ -252,6 +254,40 @@ class TestWindows:
             assert top >= 2 * tile_size or outer_top == 0
             assert rows - top - height >= 2 * tile_size or at_end
             assert columns - left - width >= 2 * tile_size or outer_left + columns == 128
+
+    @pytest.mark.parametrize(
+        ("shutter", "params", "context"),
+        [
+            (Shutter(1.0), {"reach": "tile"}, 16),
+            (Shutter(1.0), {"reach": "frame"}, 25 + 8),
+            (Shutter(0.5), {"reach": "frame"}, 13 + 8),
+            (Shutter(0.5, "trailing"), {"reach": "frame"}, 25 + 8),
+            (Shutter(1.0), {"reach": "frame", "max_reach": 10.0}, 10 + 8),
+        ],
+    )
+    def test_context_follows_the_reach(self, shutter, params, context):
+        size = (400, 400)
+        frame = tiny_frame(1, size)
+        velocity = torch.zeros_like(frame.velocity)
+        velocity[:, 0, 200:216, 200:216] = 50.0
+        case = dataclasses.replace(
+            planted_case(1),
+            frame=dataclasses.replace(frame, velocity=velocity),
+            reference=frame.color,
+            band=torch.zeros(1, 1, *size, dtype=torch.bool),
+            shutter=shutter,
+        )
+        blur = get_filter("guertin2014")(tile_size=8, **params)
+        crops = Crops(size=16, per_frame=4)
+        for sample in make_samples([case], crops, tile_size=8, seed=0, blur=blur):
+            top, left, height, width = sample.inner
+            ends = [
+                size - at - edge
+                for size, at, edge in zip(sample.size, (top, left), (height, width), strict=True)
+            ]
+            assert min(top, left) >= context
+            assert min(ends) >= context
+            assert max(top, left) < context + 8
 
     def test_windows_lie_where_something_moves(self):
         frame = tiny_frame(1)
