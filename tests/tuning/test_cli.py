@@ -14,7 +14,15 @@ from typer.testing import CliRunner
 
 from torchblur.filters import get_filter, registered_filters
 from torchblur.frame import Shutter
-from torchblur.io import read_channels, read_exr, read_frame, read_image, save_yaml, write_image
+from torchblur.io import (
+    read_channels,
+    read_exr,
+    read_frame,
+    read_image,
+    save_yaml,
+    write_frame,
+    write_image,
+)
 from torchblur.metrics import border_band, display_encode, evaluate
 from torchblur.params import declared
 from torchblur.presets import Preset, create_filter, save_preset
@@ -256,6 +264,23 @@ class TestFilter:
         assert "guertin2014" not in done.stdout
         assert len(row(done.stdout, "line")) == 6
 
+    @pytest.mark.filterwarnings("always")
+    def test_what_a_filter_cuts_is_one_line_for_all_frames(self, tmp_path):
+        for number, speed in enumerate((200.0, 220.0, 240.0), start=1):
+            frame = moving_square(speed=speed)
+            write_frame(tmp_path / f"sharp.{number:04d}.exr", frame)
+            write_image(tmp_path / f"reference.{number:04d}.exr", frame.color)
+        given = ("--reference", tmp_path / "reference.####.exr", "--set", "num_samples=5")
+        result = run("filter", "jimenez2014", tmp_path / "sharp.####.exr", *given)
+        told = [line for line in result.stderr.splitlines() if line.startswith("warning")]
+        # One line for the filter, and one for each of those that it is compared with.
+        assert [line.split(":")[1].strip() for line in told] == [
+            "jimenez2014",
+            "mcguire2012",
+            "guertin2014",
+        ]
+        assert all("and are cut there" in line for line in told)
+
     def test_mean_over_a_sequence(self, shot):
         folder = shot[0].parent
         common = ("filter", "line", "--reference", folder / "reference.####.exr")
@@ -446,6 +471,12 @@ class TestTune:
         assert str(tmp_path / "run/preset.yaml") in output
         assert (tmp_path / "run/report.html").is_file()
         run("filter", tmp_path / "run/preset.yaml", shot[0], "-o", tmp_path / "out.exr")
+
+    @pytest.mark.filterwarnings("always")
+    def test_what_is_cut_is_no_warning(self, config, tmp_path):
+        result = run("tune", config, "-o", tmp_path / "run", "--set", "filter.params.tile_size=2")
+        assert "warning" not in result.stderr
+        assert "are cut" not in result.output
 
     def test_existing_run_is_kept(self, config, tmp_path):
         run("tune", config, "-o", tmp_path / "run")
