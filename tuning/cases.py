@@ -36,6 +36,7 @@ class Case:
         view: What part of the frame it shows, if it is a window: others of it are no repetition.
         item: Key of the data's item that it comes from; equal for frames that share its weight.
         weight: Of that item, if it has one.
+        of_lines: Height of the camera's whole image, px, if it is a window of one.
     """
 
     name: str
@@ -50,11 +51,17 @@ class Case:
     view: str = ""
     item: str = ""
     weight: float | None = None
+    of_lines: int | None = None
 
     @property
     def size(self) -> tuple[int, int]:
         """Height and width in px."""
         return self.frame.size
+
+    @property
+    def lines(self) -> int:
+        """Height of the camera's whole image, px."""
+        return self.of_lines or self.size[0]
 
     @property
     def identities(self) -> tuple[str, ...]:
@@ -99,6 +106,7 @@ class SequenceCase:
         seed: Seed of the stream: the same frames with another one are no repetition.
         item: As in `Case`.
         weight: As in `Case`.
+        of_lines: As in `Case`.
     """
 
     name: str
@@ -117,6 +125,7 @@ class SequenceCase:
     seed: int = 0
     item: str = ""
     weight: float | None = None
+    of_lines: int | None = None
 
     def __len__(self) -> int:
         return len(self.references)
@@ -125,6 +134,11 @@ class SequenceCase:
     def size(self) -> tuple[int, int]:
         """Height and width in px."""
         return self.samples[0][0].size
+
+    @property
+    def lines(self) -> int:
+        """Height of the camera's whole image, px."""
+        return self.of_lines or self.size[0]
 
     @property
     def cuts(self) -> tuple[int, ...]:

@@ -76,13 +76,18 @@ class Scored:
         filter: Name of the filter's entry; "sharp" and "line" for what all are compared with.
         variant: "default"; "given" with the entry's own values and not fitted; "tuned" on the
             other cases; "" of the sharp frame.
-        sums: Over tiles.
+        heights: Sums over tiles by the height of the camera's image, px.
     """
 
     case: str
     filter: str
     variant: str
-    sums: Sums
+    heights: Mapping[int, Sums]
+
+    @property
+    def sums(self) -> Sums:
+        """Over tiles of all frames."""
+        return Sums.joined(list(self.heights.values()))
 
 
 @dataclass(frozen=True, eq=False)
@@ -175,10 +180,10 @@ def _work(config: CrossfitConfig, folder: Path, job: _Job) -> None:
         if path.is_file():
             continue
         cases = cases or _load(config, config.scored(job.case), f"cases.{job.case}")
-        sums = tile_sums(cases, _variant(config, one, cases), config.bootstrap.tile)
+        found = _score(cases, _variant(config, one, cases), config.bootstrap.tile)
         make_folders([path])
         with output_file(path, overwrite=True) as temporary:
-            temporary.write_text(json.dumps(sums.plain()), encoding="utf-8")
+            temporary.write_text(json.dumps(found), encoding="utf-8")
 
 
 # -- fits ------------------------------------------------------------------------------------------
@@ -250,6 +255,20 @@ def _variant(config: CrossfitConfig, shown: _Shown, cases: Sequence[AnyCase]) ->
     return Variant(name=shown.filter, blur=blur.to(fit_device(config.device)), free=shown.free)
 
 
+def _score(cases: Sequence[AnyCase], variant: Variant, tile: int) -> dict[str, Any]:
+    """Return what a score's file holds."""
+    by_height: dict[int, list[AnyCase]] = {}
+    for case in cases:
+        by_height.setdefault(case.lines, []).append(case)
+    sums = {lines: tile_sums(some, variant, tile) for lines, some in by_height.items()}
+    return {"heights": {lines: s.plain() for lines, s in sums.items() if len(s)}}
+
+
+def _read_score(path: Path, **of: str) -> Scored:
+    data = json.loads(path.read_text(encoding="utf-8"))
+    return Scored(heights={int(lines): Sums(s) for lines, s in data["heights"].items()}, **of)
+
+
 def _score_path(config: CrossfitConfig, folder: Path, shown: _Shown, case: str) -> Path:
     """Return a score's file; its name depends on all that its figures do, the source included."""
     parts = [shown.kind, dict(shown.params), list(shown.free), config.data.root]
@@ -293,9 +312,9 @@ def _collected(config: CrossfitConfig, folder: Path) -> Crossfit:
         shown.sort(key=lambda one: order.index(one.filter))
         for one in shown:
             path = _score_path(config, folder, one, case)
-            sums = Sums(json.loads(path.read_text(encoding="utf-8")))
-            if len(sums):
-                scored.append(Scored(case=case, filter=one.filter, variant=one.variant, sums=sums))
+            found = _read_score(path, case=case, filter=one.filter, variant=one.variant)
+            if found.heights:
+                scored.append(found)
     return Crossfit(tuple(folds.values()), tuple(scored))
 
 

@@ -118,4 +118,5 @@ def score_image(case: Case, variant: str, image: Tensor) -> CaseScore:
         split="train" if case.split == "train" else "holdout",
         variant=variant,
         scores={name: finite_or_none(float(value)) for name, value in figures.items()},
+        lines=case.lines,
     )

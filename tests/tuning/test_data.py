@@ -171,6 +171,19 @@ class TestExr:
         picked = load_cases(spec_of(tmp_path, train=[item | {"frames": [10]}]))
         assert [c.name for c in picked] == ["walk 0010"]
 
+    def test_lines_of_a_larger_camera(self, tmp_path):
+        exr_case(tmp_path / "a", 1)
+        item = {"kind": "exr", "path": "a"}
+        spec = spec_of(tmp_path, train=[item])
+        assert load_cases(spec)[0].lines == 48
+        assert "lines" not in spec.model_dump()["train"][0]
+        spec = spec_of(tmp_path, train=[item | {"lines": 1080}])
+        assert load_cases(spec)[0].lines == 1080
+        assert build(DataSpec, spec.model_dump()) == spec
+        small = spec_of(tmp_path, train=[item | {"lines": 47}])
+        with pytest.raises(ConfigError, match=r"at least the frame's, 48 px, got 47 \(data\.train"):
+            load_cases(small)
+
     def test_layers_of_a_gbuffer(self, tmp_path):
         exr_case(tmp_path / "one", seed=1)
         other = tiny_frame(2)
