@@ -20,7 +20,7 @@ from tuning.pareto_files import front_method
 from tuning.pareto_report import front_section
 from tuning.pareto_result import ParetoResult
 from tuning.report import default_label, figures_tables
-from tuning.result import FitResult, ParameterResult, worse_text
+from tuning.result import FitResult, ParameterResult, cut_text, worse_text
 
 __all__ = ["Card", "card_text"]
 
@@ -103,11 +103,11 @@ def card_text(card: Card, used: str, picture: str, caption: str, plot: str | Non
 def _head(card: Card, used: str) -> str:
     kind = get_filter(card.preset.filter)
     summary = " ".join((kind.__doc__ or "").split()).split(". ")[0].rstrip(".")
-    worse = worse_text(card.result, card.variant)
+    worse, cut = (text(card.result, card.variant) for text in (worse_text, cut_text))
     return (
         (f"**{worse}**\n\n" if worse else "")
         + f"{summary}: `{card.preset.filter}` with constants that were fitted to references"
-        f"{_heights(card.result)}.\n\n"
+        f"{_heights(card.result)}.{f' {cut}' if cut else ''}\n\n"
         f"```\n{card.result.command}\ntorchblur filter {used} INPUT.exr -o OUTPUT.exr\n```\n\n"
         f"The first command makes it (search and gradient: {_time(card.result)}), the second uses "
         "it."

@@ -73,6 +73,10 @@ class Case:
         """What no other case of the same split may have."""
         return ((self.identity, self.shutter, self.view),)
 
+    def steps(self, blur: BlurFilter | None = None) -> tuple[tuple[Frame, ...], ...]:
+        """Return what any filter is given: the frame."""
+        return ((self.frame,),)
+
     def to(self, device: torch.device | str) -> Case:
         """Return the case with its tensors on another device."""
         return dataclasses.replace(
@@ -193,7 +197,7 @@ def check_needs(blur: BlurFilter, cases: Several[AnyCase]) -> None:
         ConfigError: naming the filter, the layers, the first case and what it has.
     """
     for case in cases:
-        frames = (case.frame,) if isinstance(case, Case) else case.steps(blur)[0]
+        frames = case.steps(blur)[0]
         missing = [n for n in blur.needs if any(n not in frame.layers() for frame in frames)]
         if not missing:
             continue

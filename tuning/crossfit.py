@@ -32,7 +32,7 @@ from tuning.preparation import fit_device, prepare
 from tuning.progress import Progress, Stage
 from tuning.runfolder import open_run
 from tuning.study import slug, source_hash
-from tuning.variants import Variant
+from tuning.variants import Variant, cut_of
 from tuning.worker_pool import worker_pool
 
 __all__ = ["Crossfit", "Fold", "Scored", "run_crossfit"]
@@ -77,12 +77,15 @@ class Scored:
         variant: "default"; "given" with the entry's own values and not fitted; "tuned" on the
             other cases; "" of the sharp frame.
         heights: Sums over tiles by the height of the camera's image, px.
+        cuts: Of each frame or sequence the share of the pixels that move farther than the filter
+            blurs, and the longest half spread, px; of a filter without such a limit nothing.
     """
 
     case: str
     filter: str
     variant: str
     heights: Mapping[int, Sums]
+    cuts: tuple[tuple[float, float], ...] = ()
 
     @property
     def sums(self) -> Sums:
@@ -261,12 +264,19 @@ def _score(cases: Sequence[AnyCase], variant: Variant, tile: int) -> dict[str, A
     for case in cases:
         by_height.setdefault(case.lines, []).append(case)
     sums = {lines: tile_sums(some, variant, tile) for lines, some in by_height.items()}
-    return {"heights": {lines: s.plain() for lines, s in sums.items() if len(s)}}
+    cuts = [
+        (cut.share, cut.longest) for case in cases if (cut := cut_of(variant, case)) is not None
+    ]
+    return {"heights": {lines: s.plain() for lines, s in sums.items() if len(s)}, "cuts": cuts}
 
 
 def _read_score(path: Path, **of: str) -> Scored:
     data = json.loads(path.read_text(encoding="utf-8"))
-    return Scored(heights={int(lines): Sums(s) for lines, s in data["heights"].items()}, **of)
+    return Scored(
+        heights={int(lines): Sums(sums) for lines, sums in data["heights"].items()},
+        cuts=tuple((share, longest) for share, longest in data["cuts"]),
+        **of,
+    )
 
 
 def _score_path(config: CrossfitConfig, folder: Path, shown: _Shown, case: str) -> Path:

@@ -38,7 +38,7 @@ def crossfit(
     from tuning.crossfit import run_crossfit
     from tuning.crossfit_config import load_crossfit_config
     from tuning.crossfit_files import COLUMNS, TARGETS, UNSURE, cell, note_of, write_crossfit
-    from tuning.crossfit_summary import MEAN, mean_names, summary_of, verdicts
+    from tuning.crossfit_summary import MEAN, cut_texts, mean_names, summary_of, verdicts
 
     folder = output or Path("runs") / config.stem
     loaded = load_crossfit_config(config, set_ or [])
@@ -60,6 +60,8 @@ def crossfit(
             if row.case == mean:
                 table.add_row(row.label, *(cell(row, name, interval=False) for name in shown))
         results.print(table)
+    for text in cut_texts(loaded, found):
+        results.print(text, markup=False, soft_wrap=True)
     every = verdicts(loaded, found, rows)
     cases = (*loaded.data.cases, *means)
     for target, limit in loaded.targets.items():

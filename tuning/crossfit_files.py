@@ -14,7 +14,7 @@ from torchblur.io.paths import output_file
 from tuning.crossfit import Crossfit, Fold
 from tuning.crossfit_config import CrossfitConfig
 from tuning.crossfit_plots import plot_crossfit
-from tuning.crossfit_summary import MEAN, Row, mean_names, summary_of, verdicts
+from tuning.crossfit_summary import MEAN, Row, cut_texts, mean_names, summary_of, verdicts
 from tuning.crossfit_tiles import Figure
 from tuning.outputs import make_folders
 
@@ -103,6 +103,9 @@ def _markdown(config: CrossfitConfig, found: Crossfit, rows: Sequence[Row]) -> s
         own = [row for row in rows if row.case == case]
         cells = [[row.label, *(cell(row, name) for name in COLUMNS)] for row in own]
         lines += [f"## {heading}", "", *_table(head, cells)]
+    cuts = cut_texts(config, found)
+    if cuts:
+        lines += ["## Cut short", "", *(f"- {text}" for text in cuts), ""]
     lines += _targets(config, found, list(rows))
     fitted = [name for name, entry in config.filters.items() if entry.is_fitted]
     if fitted:
@@ -162,6 +165,7 @@ def _json(config: CrossfitConfig, found: Crossfit, rows: list[Row]) -> str:
         "torchblur": version("torchblur"),
         "rows": [dataclasses.asdict(row) for row in rows],
         "targets": [dataclasses.asdict(v) for v in verdicts(config, found, rows)],
+        "cut": cut_texts(config, found),
         "folds": [dataclasses.asdict(fold) for fold in found.folds],
         "config": config.model_dump(mode="json"),
     }

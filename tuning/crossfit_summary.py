@@ -11,11 +11,13 @@ import numpy as np
 from tuning.crossfit import Crossfit, Scored
 from tuning.crossfit_config import CrossfitConfig, Target
 from tuning.crossfit_tiles import Figure, draws_of, figures_of, summarize
+from tuning.cuts import cuts_over
 
 __all__ = [
     "MEAN",
     "Row",
     "Verdict",
+    "cut_texts",
     "final_variants",
     "is_met",
     "mean_names",
@@ -106,6 +108,22 @@ def mean_names(config: CrossfitConfig, rows: Sequence[Row]) -> tuple[str, ...]:
         rows: What `summary_of` returned.
     """
     return tuple(dict.fromkeys(row.case for row in rows if row.case not in config.data.cases))
+
+
+def cut_texts(config: CrossfitConfig, found: Crossfit) -> list[str]:
+    """Return what each filter cuts short, as it is judged, a sentence each; nothing if nothing.
+
+    Args:
+        config: The crossfit.
+        found: What `run_crossfit` returned.
+    """
+    texts = []
+    for name, variant in final_variants(config, found).items():
+        every = [s for s in found.scored if (s.filter, s.variant) == (name, variant)]
+        cuts = cuts_over([cut for one in every for cut in one.cuts])
+        if cuts is not None:
+            texts.append(f"{name} {variant}: {cuts.text('frames')}.")
+    return texts
 
 
 def final_variants(config: CrossfitConfig, found: Crossfit) -> dict[str, str]:

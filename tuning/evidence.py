@@ -48,12 +48,18 @@ def evidence_of(
         if any(case.split == split for case in cases)
         for lines in heights
     }
+    cuts = {
+        name: cut._asdict()
+        for name in variants
+        if (cut := result.cuts(name, "holdout")) is not None
+    }
     return {
         "train": [case.name for case in cases if case.split == "train"],
         "holdout": [case.name for case in cases if case.split == "holdout"],
         "objective": objective.model_dump(mode="json"),
         **found,
         "figures": figures,
+        **({"cut": cuts} if cuts else {}),
         "seed": result.seed,
         "command": result.command,
         "versions": result.versions,

@@ -30,7 +30,7 @@ from tuning.console import (
 )
 from tuning.outputs import State
 from tuning.pareto_report import preset_names
-from tuning.result import FitResult, height_name
+from tuning.result import FitResult, cut_text, height_name
 
 __all__ = [
     "print_ablation",
@@ -248,7 +248,8 @@ def print_fit(result: FitResult, folder: Path) -> None:
         unit = "" if row.unit == "1" else row.unit
         table.add_row(Text(row.name), _plain_short(row.default), _plain_short(row.tuned), unit)
     results.print(table)
-    for note in result.notes:
+    cut = cut_text(result, "tuned")
+    for note in (*result.notes, *([f"Tuned: {cut}"] if cut else [])):
         log(f"note: {note}")
     results.print(f"preset: {folder / 'preset.yaml'}", soft_wrap=True)
     if presets:

@@ -18,7 +18,15 @@ from tuning.config import TuneConfig
 from tuning.page import Column, Row, Table, View, make_view, render_page
 from tuning.pareto_report import front_section, preset_names
 from tuning.plots import loss_curves, parameter_paths
-from tuning.result import FitResult, MethodResult, ParameterResult, height_name, worse_text
+from tuning.result import (
+    CaseScore,
+    FitResult,
+    MethodResult,
+    ParameterResult,
+    cut_text,
+    height_name,
+    worse_text,
+)
 from tuning.runfolder import RunFolder
 from tuning.sensitivity_rows import slope_rows
 from tuning.sequence_plots import score_curves
@@ -112,7 +120,7 @@ def write_report(
         result=result,
         train_text=_counted([case for case in cases if case.split == "train"]),
         verdict=verdict_of(result),
-        notes=result.notes,
+        notes=(*result.notes, *([f"Tuned: {cut}"] if (cut := cut_text(result, "tuned")) else [])),
         tables=figures_tables(result),
         explanations=[text for n, text in _EXPLAINED.items() if n in result.variants()],
         front=front_section(result),
@@ -360,22 +368,30 @@ def _paths(result: FitResult, records: Sequence[dict[str, Any]]) -> list[tuple[s
 
 
 def _case_table(result: FitResult) -> Table:
-    by_case: dict[str, dict[str, dict[str, float | None]]] = {}
-    splits = {score.case: score.split for score in result.scores}
+    by_case: dict[str, dict[str, CaseScore]] = {}
     for score in result.scores:
-        by_case.setdefault(score.case, {})[score.variant] = score.scores
+        by_case.setdefault(score.case, {})[score.variant] = score
+    shown = {"flip": ("FLIP", 4), "psnr": ("PSNR", 2), "flip_band": ("FLIP, borders", 4)}
+    both = ("default", "tuned")
+    if any(result.cuts(name, split) for name in both for split in _SPLITS):
+        shown["cut"] = ("cut, %", 1)
     rows = []
     for case, variants in by_case.items():
-        values: list[float | None] = []
-        for metric in ("flip", "psnr", "flip_band"):
-            values += [variants["default"][metric], variants["tuned"][metric]]
-        rows.append(Row(name=case, values=values, note=_SPLITS[splits[case]].lower()))
+        values = [_case_figure(variants[name], metric) for metric in shown for name in both]
+        note = _SPLITS[variants["tuned"].split].lower()
+        rows.append(Row(name=case, values=values, note=note))
     columns = [
         Column(name=f"{label} {what}", digits=digits)
-        for label, digits in (("FLIP", 4), ("PSNR", 2), ("FLIP, borders", 4))
+        for label, digits in shown.values()
         for what in ("before", "after")
     ]
     return Table(title="", columns=columns, rows=rows)
+
+
+def _case_figure(score: CaseScore, metric: str) -> float | None:
+    if metric == "cut":
+        return None if score.cut is None else 100 * score.cut
+    return score.scores[metric]
 
 
 def _short(value: Any) -> str:

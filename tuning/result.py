@@ -10,6 +10,7 @@ from pydantic import Field
 
 from torchblur.errors import ConfigError
 from torchblur.params import Config, build
+from tuning.cuts import Cuts, cuts_over
 from tuning.pareto_result import ParetoResult
 
 __all__ = [
@@ -20,6 +21,7 @@ __all__ = [
     "ParameterResult",
     "SensitivityResult",
     "StartResult",
+    "cut_text",
     "height_name",
     "worse_text",
 ]
@@ -132,6 +134,11 @@ class CaseScore(Config):
     """Of a sequence: its frames in order."""
     lines: int | None = None
     """Height of the camera's whole image, px; null in results that do not say it."""
+    cut: float | None = None
+    """Share of the pixels that move farther than the filter blurs, of a sequence the mean; null
+    where there is no such limit."""
+    longest: float | None = None
+    """Longest half spread of the case, px; null where `cut` is."""
 
 
 class FitResult(Config):
@@ -208,6 +215,16 @@ class FitResult(Config):
                 found.append((lines, own, line))
         return found
 
+    def cuts(self, variant: str, split: str) -> Cuts | None:
+        """Return what a variant cuts short of the cases of a split, or None if nothing.
+
+        Args:
+            variant: As in `CaseScore.variant`.
+            split: "train" or "holdout".
+        """
+        scores = [s for s in self.scores if (s.variant, s.split) == (variant, split)]
+        return cuts_over([(score.cut or 0.0, score.longest or 0.0) for score in scores])
+
     @classmethod
     def load(cls, path: Path) -> FitResult:
         """Read a result.json.
@@ -220,6 +237,24 @@ class FitResult(Config):
         except (OSError, ValueError) as error:
             raise ConfigError(f"{path} is no result of a fit: {error}") from error
         return build(cls, data, str(path))
+
+
+def cut_text(result: FitResult, variant: str) -> str:
+    """Return what a variant cuts short of the hold-out, or of what was fitted, in a sentence.
+
+    Args:
+        result: A fit's result.
+        variant: As in `CaseScore.variant`.
+
+    Returns:
+        The sentence, or nothing if nothing is cut of either.
+    """
+    for split, frames in (("holdout", "hold-out frames"), ("train", "training frames")):
+        cuts = result.cuts(variant, split)
+        if cuts is not None:
+            text = cuts.text(frames)
+            return f"{text[0].upper()}{text[1:]}."
+    return ""
 
 
 def height_name(lines: int | None) -> str:

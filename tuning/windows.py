@@ -230,9 +230,8 @@ def _context(case: AnyCase, crops: Crops | None, tile_size: int, blur: BlurFilte
         return crops.context
     if not isinstance(blur, ReachingBlur) or getattr(blur.config, "reach", "tile") == "tile":
         return 2 * tile_size
-    frames = [case.frame] if isinstance(case, Case) else [f for s in case.steps(blur) for f in s]
     given = {"shutter": case.shutter.open, "shutter_position": case.shutter.position}
-    cuts = [blur.cut(frame, **given) for frame in frames]
+    cuts = [blur.cut(frame, **given) for step in case.steps(blur) for frame in step]
     reach = max(min(cut.longest, cut.reach) for cut in cuts)
     # Taps of a shutter that is not centered lie on one side, twice as far from the pixel.
     return math.ceil(reach * (1 + abs(case.shutter.center))) + tile_size

@@ -363,6 +363,24 @@ class TestHeights:
         assert "Mean over the cases that were left out, 1080 lines" in output
 
 
+@pytest.mark.filterwarnings("error")
+def test_what_is_cut_is_told(finished):
+    """Half spreads are 2, 3 and 4 px; two frames are of the second case."""
+    assert not (finished.folder / "tables.md").read_text().count("Cut short")
+
+    def change(data):
+        data["filters"].pop("guertin")
+        data["filters"]["mcguire"]["filter"]["params"]["tile_size"] = 2
+
+    config = loaded(finished.root, change, "cut.yaml")
+    files = write_crossfit(
+        finished.root / "cut", config, run_crossfit(config, finished.root / "cut")
+    )
+    text = files[0].read_text()
+    assert "- mcguire given: on 3 of 4 frames it cuts short up to 4.7 % of the pixels" in text
+    assert "goes up to 4 px to each side." in text
+
+
 class TestTargets:
     def test_sides(self):
         assert is_met("flip_ratio", 0.75, 0.75)
