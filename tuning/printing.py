@@ -30,6 +30,7 @@ from tuning.console import (
 )
 from tuning.outputs import State
 from tuning.pareto_report import preset_names
+from tuning.reach_advice import SHUTTER, reach_advice
 from tuning.result import FitResult, cut_text, height_name
 
 __all__ = [
@@ -181,6 +182,8 @@ def _facts(found: Inspection) -> Iterable[tuple[str, str]]:
             f"{speed.moving_share:.1%} of the pixels move: median {speed.median:.1f}, 95 % "
             f"{speed.percentile_95:.1f}, greatest {speed.maximum:.1f} px/frame",
         )
+        if speed.moving_share > 0:
+            yield f"at shutter {SHUTTER:g}", reach_advice(speed.percentiles)
     if found.time is not None and found.time.is_stream:
         times = found.time
         yield (

@@ -437,6 +437,49 @@ class TestInspect:
         assert "warning: " in result.stderr
         assert "no velocity channels" in result.stderr
 
+    @pytest.mark.parametrize(
+        ("columns", "speed", "text"),
+        [
+            (
+                16, 347.0,
+                "longest blur 87 px to each side (99 % of the pixels: 87 px); the default follows "
+                "it; filters of papers need reach=frame or a tile_size of 87 (guertin2014 has 40: "
+                "25 % of the pixels would be cut)",
+            ),
+            (
+                16, 100.0,
+                "longest blur 25 px to each side (99 % of the pixels: 25 px); the default follows "
+                "it; filters of papers need reach=frame or a tile_size of 25 (jimenez2014 has 20: "
+                "25 % of the pixels would be cut)",
+            ),
+            (16, 60.0, "longest blur 15 px to each side (99 % of the pixels: 15 px); all filters"),
+            (
+                16, 3000.0,
+                "the default follows it up to 512 px; all of it needs reach=frame and a max_reach "
+                "of 750",
+            ),
+        ],
+    )  # fmt: skip
+    def test_says_which_reach_it_needs(self, tmp_path, columns, speed, text):
+        velocity = np.zeros((HEIGHT, WIDTH))
+        velocity[:, :columns] = speed
+        write_channels(tmp_path / "a.exr", velocity_X=velocity, velocity_Y=np.zeros_like(velocity))
+        output = run("inspect", tmp_path / "a.exr").stdout
+        (line,) = [line for line in output.splitlines() if line.startswith("at shutter 0.5")]
+        assert text in line
+
+    def test_few_fast_pixels_are_less_than_a_percent(self, tmp_path):
+        velocity = np.zeros((HEIGHT, WIDTH))
+        velocity[0, 0] = 347.0
+        write_channels(tmp_path / "a.exr", velocity_X=velocity)
+        output = run("inspect", tmp_path / "a.exr").stdout
+        assert "(99 % of the pixels: 0 px)" in output
+        assert "guertin2014 has 40: less than 1 % of the pixels" in output
+
+    def test_a_still_frame_needs_no_reach(self, tmp_path):
+        write_channels(tmp_path / "a.exr", velocity_X=np.zeros((HEIGHT, WIDTH)))
+        assert "at shutter" not in run("inspect", tmp_path / "a.exr").stdout
+
     def test_signs_are_tried_with_a_reference(self, shot):
         output = run(
             "inspect", shot[0], "--reference", shot[0].parent / "reference.0001.exr"
