@@ -1,4 +1,7 @@
-"""Calling a filter with the data's shutter and with values of a fit: on a frame, on a sequence."""
+"""Calling a filter with the data's shutter and with values of a fit: on a frame, on a sequence.
+
+Fits call thousands of times, so what a filter cuts short is no warning here: their results say it.
+"""
 
 from __future__ import annotations
 
@@ -10,6 +13,7 @@ from torch import Tensor
 
 from torchblur.filters import BlurFilter
 from torchblur.filters.base import TemporalBlur
+from torchblur.filters.reach import ReachingBlur
 from torchblur.frame import Frame
 
 __all__ = ["arguments", "blurred", "blurred_sequence"]
@@ -33,6 +37,7 @@ def blurred(
         values: Values by name: (K,) tensors, numbers, or choices.
         free: Names of the free parameters; the shutter is left alone if it is one of them.
     """
+    _keep_quiet(blur)
     given = arguments(shutter, position, values, free, frame.device)
     return blur.layers(frame, **given)["color"]
 
@@ -82,6 +87,7 @@ def blurred_sequence(
         unroll: Let gradients go back through at most so many frames: the memory is cut off from
             the graph after every k-th frame. All of them if left out.
     """
+    _keep_quiet(blur)
     if not isinstance(blur, TemporalBlur):
         for step in steps:
             colors = [blur.layers(frame, **given)["color"] for frame in step]
@@ -93,3 +99,8 @@ def blurred_sequence(
         if unroll is not None and (index + 1) % unroll == 0:
             history = history.detach()
         yield layers["color"]
+
+
+def _keep_quiet(blur: BlurFilter) -> None:
+    if isinstance(blur, ReachingBlur):
+        blur.keep_quiet()

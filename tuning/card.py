@@ -19,8 +19,8 @@ from tuning.page import Row, Table
 from tuning.pareto_files import front_method
 from tuning.pareto_report import front_section
 from tuning.pareto_result import ParetoResult
-from tuning.report import default_label, figures_table
-from tuning.result import FitResult, ParameterResult
+from tuning.report import default_label, figures_tables
+from tuning.result import FitResult, ParameterResult, cut_text, worse_text
 
 __all__ = ["Card", "card_text"]
 
@@ -103,11 +103,23 @@ def card_text(card: Card, used: str, picture: str, caption: str, plot: str | Non
 def _head(card: Card, used: str) -> str:
     kind = get_filter(card.preset.filter)
     summary = " ".join((kind.__doc__ or "").split()).split(". ")[0].rstrip(".")
+    worse, cut = (text(card.result, card.variant) for text in (worse_text, cut_text))
     return (
-        f"{summary}: `{card.preset.filter}` with constants that were fitted to references.\n\n"
+        (f"**{worse}**\n\n" if worse else "")
+        + f"{summary}: `{card.preset.filter}` with constants that were fitted to references"
+        f"{_heights(card.result)}.{f' {cut}' if cut else ''}\n\n"
         f"```\n{card.result.command}\ntorchblur filter {used} INPUT.exr -o OUTPUT.exr\n```\n\n"
         f"The first command makes it (search and gradient: {_time(card.result)}), the second uses "
         "it."
+    )
+
+
+def _heights(result: FitResult) -> str:
+    """Return at which heights of images it was fitted and held out, if the result says it."""
+    return "".join(
+        f" {what} {' and '.join(map(str, heights))} lines"
+        for split, what in (("train", "of"), ("holdout", "and held out at"))
+        if (heights := result.heights(split))
     )
 
 
@@ -121,12 +133,10 @@ def _time(result: FitResult) -> str:
 
 def _figures(card: Card) -> list[str]:
     parts = ["## Before and after"]
-    for split in _SPLITS:
-        table = figures_table(card.result, split)
-        if table is not None:
-            rows = [_named(row, card) for row in table.rows if _is_shown(row.name, card)]
-            shown = Table(title="", columns=table.columns, rows=rows)
-            parts += [f"{table.title}; means. The best of a column is bold.", _markdown(shown)]
+    for table in figures_tables(card.result):
+        rows = [_named(row, card) for row in table.rows if _is_shown(row.name, card)]
+        shown = Table(title="", columns=table.columns, rows=rows)
+        parts += [f"{table.title}; means. The best of a column is bold.", _markdown(shown)]
     parts.append(
         "FLIP and SSIM are of display values, PSNR is in dB on linear color; “borders” is the band "
         "that moving borders sweep. “A perfect image” is what the reference's own noise leaves."

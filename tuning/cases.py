@@ -36,6 +36,7 @@ class Case:
         view: What part of the frame it shows, if it is a window: others of it are no repetition.
         item: Key of the data's item that it comes from; equal for frames that share its weight.
         weight: Of that item, if it has one.
+        of_lines: Height of the camera's whole image, px, if it is a window of one.
     """
 
     name: str
@@ -50,11 +51,17 @@ class Case:
     view: str = ""
     item: str = ""
     weight: float | None = None
+    of_lines: int | None = None
 
     @property
     def size(self) -> tuple[int, int]:
         """Height and width in px."""
         return self.frame.size
+
+    @property
+    def lines(self) -> int:
+        """Height of the camera's whole image, px."""
+        return self.of_lines or self.size[0]
 
     @property
     def identities(self) -> tuple[str, ...]:
@@ -65,6 +72,10 @@ class Case:
     def repeats(self) -> tuple[Hashable, ...]:
         """What no other case of the same split may have."""
         return ((self.identity, self.shutter, self.view),)
+
+    def steps(self, blur: BlurFilter | None = None) -> tuple[tuple[Frame, ...], ...]:
+        """Return what any filter is given: the frame."""
+        return ((self.frame,),)
 
     def to(self, device: torch.device | str) -> Case:
         """Return the case with its tensors on another device."""
@@ -99,6 +110,7 @@ class SequenceCase:
         seed: Seed of the stream: the same frames with another one are no repetition.
         item: As in `Case`.
         weight: As in `Case`.
+        of_lines: As in `Case`.
     """
 
     name: str
@@ -117,6 +129,7 @@ class SequenceCase:
     seed: int = 0
     item: str = ""
     weight: float | None = None
+    of_lines: int | None = None
 
     def __len__(self) -> int:
         return len(self.references)
@@ -125,6 +138,11 @@ class SequenceCase:
     def size(self) -> tuple[int, int]:
         """Height and width in px."""
         return self.samples[0][0].size
+
+    @property
+    def lines(self) -> int:
+        """Height of the camera's whole image, px."""
+        return self.of_lines or self.size[0]
 
     @property
     def cuts(self) -> tuple[int, ...]:
@@ -179,7 +197,7 @@ def check_needs(blur: BlurFilter, cases: Several[AnyCase]) -> None:
         ConfigError: naming the filter, the layers, the first case and what it has.
     """
     for case in cases:
-        frames = (case.frame,) if isinstance(case, Case) else case.steps(blur)[0]
+        frames = case.steps(blur)[0]
         missing = [n for n in blur.needs if any(n not in frame.layers() for frame in frames)]
         if not missing:
             continue

@@ -48,6 +48,9 @@ class _Order:
     probe: Path
 
 
+_Warned = tuple[type[Warning], str]
+
+
 @dataclass
 class _Told:
     """What became of a task's frames: a reason, or None, by position; and what was not seen."""
@@ -55,7 +58,7 @@ class _Told:
     reasons: dict[int, str | None]
     worker: str
     unseen: tuple[Path, ...]
-    warnings: tuple[str, ...] = ()
+    warnings: tuple[_Warned, ...] = ()
 
 
 def run_on_cluster(
@@ -97,19 +100,20 @@ def run_on_cluster(
             probe=probe,
         )
         flight = cluster.start(partial(_make, order), sent)
-        texts: dict[int, tuple[str, ...]] = {}
+        warned: dict[int, tuple[_Warned, ...]] = {}
         stopped = False
         try:
-            _collect(flight, tasks, log, texts)
+            _collect(flight, tasks, log, warned)
         except KeyboardInterrupt:
             stopped = True
             log.stopping(flight.stop())
             try:
-                _collect(flight, tasks, log, texts)
+                _collect(flight, tasks, log, warned)
             except KeyboardInterrupt:
                 flight.drop()
-    for text in dict.fromkeys(text for position in sorted(texts) for text in texts[position]):
-        warnings.warn(text, stacklevel=2)
+    every = (one for position in sorted(warned) for one in warned[position])
+    for category, text in dict.fromkeys(every):
+        warnings.warn(text, category, stacklevel=2)
     return stopped
 
 
@@ -117,7 +121,7 @@ def _collect(
     flight: Iterable[tuple[int, _Told | Lost]],
     tasks: Sequence[Task],
     log: Log,
-    texts: dict[int, tuple[str, ...]],
+    warned: dict[int, tuple[_Warned, ...]],
 ) -> None:
     """Tell of each frame as its task ends, and keep its warnings."""
     for position, told in flight:
@@ -128,7 +132,7 @@ def _collect(
                     log.failed(job, told.reason)
             continue
         _refuse_other_disks(told)
-        texts[position] = told.warnings
+        warned[position] = told.warnings
         for index, reason in told.reasons.items():
             if reason is None:
                 log.written(task.jobs[index])
@@ -186,7 +190,7 @@ def _probe(folder: Path) -> Iterator[Path]:
 
 
 _COMPILED, _HEARING = threading.Lock(), threading.Lock()
-_HEARERS: list[list[str]] = []
+_HEARERS: list[list[_Warned]] = []
 _CATCHER = ExitStack()
 
 
@@ -218,33 +222,33 @@ def _make(order: _Order, task: Task) -> _Told:
     runner = Runner(blur, settings, order.recipe, workers=1, prefetch=order.prefetch, log=notes)
     # torch.compile is not made for several threads.
     with _COMPILED if order.engine == "compiled" else nullcontext():
-        with _heard() as texts:
+        with _heard() as heard:
             runner.run([task])
-    return _Told(notes.reasons, here(), tuple(unseen), tuple(dict.fromkeys(texts)))
+    return _Told(notes.reasons, here(), tuple(unseen), tuple(dict.fromkeys(heard)))
 
 
 @contextmanager
-def _heard() -> Iterator[list[str]]:
+def _heard() -> Iterator[list[_Warned]]:
     """Collect the warnings of this process; `warnings.catch_warnings` is not for threads."""
-    texts: list[str] = []
+    heard: list[_Warned] = []
     with _HEARING:
         if not _HEARERS:
             _CATCHER.enter_context(warnings.catch_warnings())
             warnings.simplefilter("always")
             warnings.showwarning = _hear
-        _HEARERS.append(texts)
+        _HEARERS.append(heard)
     try:
-        yield texts
+        yield heard
     finally:
         with _HEARING:
-            _HEARERS[:] = [other for other in _HEARERS if other is not texts]
+            _HEARERS[:] = [other for other in _HEARERS if other is not heard]
             if not _HEARERS:
                 _CATCHER.close()
 
 
-def _hear(message: Warning | str, *_: Any, **__: Any) -> None:
-    for texts in list(_HEARERS):
-        texts.append(str(message))
+def _hear(message: Warning | str, category: type[Warning], *_: Any, **__: Any) -> None:
+    for heard in list(_HEARERS):
+        heard.append((category, str(message)))
 
 
 @lru_cache(maxsize=4)

@@ -85,8 +85,18 @@ def _explained(error: Exception) -> tuple[str, int]:
 
 @contextmanager
 def _readable_warnings() -> Iterator[None]:
+    told: set[str] = set()
+
     def show(message: Warning | str, category: type[Warning], *_: Any, **__: Any) -> None:
-        print_warning(str(message))
+        from torchblur.errors import ReachWarning
+
+        text = str(message)
+        if issubclass(category, ReachWarning):
+            filter_name = text.partition(":")[0]
+            if filter_name in told:  # by another frame, another thread or another worker
+                return
+            told.add(filter_name)
+        print_warning(text)
 
     with warnings.catch_warnings():
         warnings.showwarning = show

@@ -32,7 +32,7 @@ from tuning.preparation import fit_device, prepare
 from tuning.progress import Progress, Stage
 from tuning.runfolder import open_run
 from tuning.study import slug, source_hash
-from tuning.variants import Variant
+from tuning.variants import Variant, cut_of
 from tuning.worker_pool import worker_pool
 
 __all__ = ["Crossfit", "Fold", "Scored", "run_crossfit"]
@@ -76,13 +76,21 @@ class Scored:
         filter: Name of the filter's entry; "sharp" and "line" for what all are compared with.
         variant: "default"; "given" with the entry's own values and not fitted; "tuned" on the
             other cases; "" of the sharp frame.
-        sums: Over tiles.
+        heights: Sums over tiles by the height of the camera's image, px.
+        cuts: Of each frame or sequence the share of the pixels that move farther than the filter
+            blurs, and the longest half spread, px; of a filter without such a limit nothing.
     """
 
     case: str
     filter: str
     variant: str
-    sums: Sums
+    heights: Mapping[int, Sums]
+    cuts: tuple[tuple[float, float], ...] = ()
+
+    @property
+    def sums(self) -> Sums:
+        """Over tiles of all frames."""
+        return Sums.joined(list(self.heights.values()))
 
 
 @dataclass(frozen=True, eq=False)
@@ -175,10 +183,10 @@ def _work(config: CrossfitConfig, folder: Path, job: _Job) -> None:
         if path.is_file():
             continue
         cases = cases or _load(config, config.scored(job.case), f"cases.{job.case}")
-        sums = tile_sums(cases, _variant(config, one, cases), config.bootstrap.tile)
+        found = _score(cases, _variant(config, one, cases), config.bootstrap.tile)
         make_folders([path])
         with output_file(path, overwrite=True) as temporary:
-            temporary.write_text(json.dumps(sums.plain()), encoding="utf-8")
+            temporary.write_text(json.dumps(found), encoding="utf-8")
 
 
 # -- fits ------------------------------------------------------------------------------------------
@@ -250,6 +258,27 @@ def _variant(config: CrossfitConfig, shown: _Shown, cases: Sequence[AnyCase]) ->
     return Variant(name=shown.filter, blur=blur.to(fit_device(config.device)), free=shown.free)
 
 
+def _score(cases: Sequence[AnyCase], variant: Variant, tile: int) -> dict[str, Any]:
+    """Return what a score's file holds."""
+    by_height: dict[int, list[AnyCase]] = {}
+    for case in cases:
+        by_height.setdefault(case.lines, []).append(case)
+    sums = {lines: tile_sums(some, variant, tile) for lines, some in by_height.items()}
+    cuts = [
+        (cut.share, cut.longest) for case in cases if (cut := cut_of(variant, case)) is not None
+    ]
+    return {"heights": {lines: s.plain() for lines, s in sums.items() if len(s)}, "cuts": cuts}
+
+
+def _read_score(path: Path, **of: str) -> Scored:
+    data = json.loads(path.read_text(encoding="utf-8"))
+    return Scored(
+        heights={int(lines): Sums(sums) for lines, sums in data["heights"].items()},
+        cuts=tuple((share, longest) for share, longest in data["cuts"]),
+        **of,
+    )
+
+
 def _score_path(config: CrossfitConfig, folder: Path, shown: _Shown, case: str) -> Path:
     """Return a score's file; its name depends on all that its figures do, the source included."""
     parts = [shown.kind, dict(shown.params), list(shown.free), config.data.root]
@@ -293,9 +322,9 @@ def _collected(config: CrossfitConfig, folder: Path) -> Crossfit:
         shown.sort(key=lambda one: order.index(one.filter))
         for one in shown:
             path = _score_path(config, folder, one, case)
-            sums = Sums(json.loads(path.read_text(encoding="utf-8")))
-            if len(sums):
-                scored.append(Scored(case=case, filter=one.filter, variant=one.variant, sums=sums))
+            found = _read_score(path, case=case, filter=one.filter, variant=one.variant)
+            if found.heights:
+                scored.append(found)
     return Crossfit(tuple(folds.values()), tuple(scored))
 
 

@@ -38,7 +38,7 @@ def crossfit(
     from tuning.crossfit import run_crossfit
     from tuning.crossfit_config import load_crossfit_config
     from tuning.crossfit_files import COLUMNS, TARGETS, UNSURE, cell, note_of, write_crossfit
-    from tuning.crossfit_summary import MEAN, summary_of, verdicts
+    from tuning.crossfit_summary import MEAN, cut_texts, mean_names, summary_of, verdicts
 
     folder = output or Path("runs") / config.stem
     loaded = load_crossfit_config(config, set_ or [])
@@ -52,13 +52,18 @@ def crossfit(
     rows = summary_of(loaded, found)
     shown = ("flip", "flip_ratio", "psnr", "flip_band", "psnr_band", "psnr_band_gain")
     labels = [COLUMNS[name][0].replace(", b", " b").replace(" b", "\nb") for name in shown]
-    table = plain_table("Mean over the cases that were left out", ("", *labels), right=labels)
-    for row in rows:
-        if row.case == MEAN:
-            table.add_row(row.label, *(cell(row, name, interval=False) for name in shown))
-    results.print(table)
+    means = mean_names(loaded, rows)
+    for mean in means:
+        title = mean.replace(MEAN, "Mean over the cases that were left out")
+        table = plain_table(title, ("", *labels), right=labels)
+        for row in rows:
+            if row.case == mean:
+                table.add_row(row.label, *(cell(row, name, interval=False) for name in shown))
+        results.print(table)
+    for text in cut_texts(loaded, found):
+        results.print(text, markup=False, soft_wrap=True)
     every = verdicts(loaded, found, rows)
-    cases = (*loaded.data.cases, MEAN)
+    cases = (*loaded.data.cases, *means)
     for target, limit in loaded.targets.items():
         texts = {(v.filter, v.case): v.text for v in every if v.target == target}
         table = plain_table(TARGETS[target].format(limit), ("", *cases))

@@ -14,7 +14,7 @@ from torchblur.io.paths import output_file
 from tuning.crossfit import Crossfit, Fold
 from tuning.crossfit_config import CrossfitConfig
 from tuning.crossfit_plots import plot_crossfit
-from tuning.crossfit_summary import MEAN, Row, summary_of, verdicts
+from tuning.crossfit_summary import MEAN, Row, cut_texts, mean_names, summary_of, verdicts
 from tuning.crossfit_tiles import Figure
 from tuning.outputs import make_folders
 
@@ -97,11 +97,15 @@ def note_of(config: CrossfitConfig) -> str:
 def _markdown(config: CrossfitConfig, found: Crossfit, rows: Sequence[Row]) -> str:
     lines = [f"# {config.title}", "", note_of(config), ""]
     head = ["", *(label for label, _ in COLUMNS.values())]
-    for case in (MEAN, *config.data.cases):
-        heading = "Mean over the cases" if case == MEAN else case
+    means = mean_names(config, rows)
+    for case in (*means, *config.data.cases):
+        heading = case.replace(MEAN, "Mean over the cases") if case in means else case
         own = [row for row in rows if row.case == case]
         cells = [[row.label, *(cell(row, name) for name in COLUMNS)] for row in own]
         lines += [f"## {heading}", "", *_table(head, cells)]
+    cuts = cut_texts(config, found)
+    if cuts:
+        lines += ["## Cut short", "", *(f"- {text}" for text in cuts), ""]
     lines += _targets(config, found, list(rows))
     fitted = [name for name, entry in config.filters.items() if entry.is_fitted]
     if fitted:
@@ -119,7 +123,7 @@ def _targets(config: CrossfitConfig, found: Crossfit, rows: list[Row]) -> list[s
     for target, limit in config.targets.items():
         texts = {(v.filter, v.case): v.text for v in every if v.target == target}
         names = dict.fromkeys(name for name, _ in texts)
-        cases = [*config.data.cases, MEAN]
+        cases = [*config.data.cases, *mean_names(config, rows)]
         head = [TARGETS[target].format(limit), *cases]
         lines += _table(head, [[n, *(texts.get((n, c), "–") for c in cases)] for n in names])
     return lines
@@ -161,6 +165,7 @@ def _json(config: CrossfitConfig, found: Crossfit, rows: list[Row]) -> str:
         "torchblur": version("torchblur"),
         "rows": [dataclasses.asdict(row) for row in rows],
         "targets": [dataclasses.asdict(v) for v in verdicts(config, found, rows)],
+        "cut": cut_texts(config, found),
         "folds": [dataclasses.asdict(fold) for fold in found.folds],
         "config": config.model_dump(mode="json"),
     }

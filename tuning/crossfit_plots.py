@@ -13,7 +13,7 @@ from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
 from torchblur.io.paths import output_file
 from tuning.crossfit import Crossfit
 from tuning.crossfit_config import CrossfitConfig
-from tuning.crossfit_summary import MEAN, Row, final_variants
+from tuning.crossfit_summary import Row, final_variants, mean_names
 from tuning.plots import color_of, style
 
 __all__ = ["plot_crossfit"]
@@ -36,7 +36,7 @@ def plot_crossfit(path: Path, config: CrossfitConfig, found: Crossfit, rows: Seq
     """
     final = final_variants(config, found)
     names = [name for name in config.filters if (name, final.get(name)) != ("line", "default")]
-    cases = [*config.data.cases, MEAN]
+    cases = [*config.data.cases, *mean_names(config, rows)]
     with mpl.rc_context(style()):
         figure = Figure(figsize=(2.2 + 1.35 * len(cases), 4.6), layout="constrained")
         axes = figure.add_subplot()
@@ -53,9 +53,9 @@ def plot_crossfit(path: Path, config: CrossfitConfig, found: Crossfit, rows: Seq
             if final[name] != "default":
                 own = {r.case: r for r in rows if (r.filter, r.variant) == (name, "default")}
                 _rings(axes, [(cases.index(c) + shift, r) for c, r in own.items()], index)
-        axes.set_xticks(range(len(cases)), [c if c != MEAN else "mean" for c in cases])
+        axes.set_xticks(range(len(cases)), [case.replace(", ", ",\n") for case in cases])
         axes.set(title=config.title, ylabel="FLIP, to that of line", yscale="log")
-        axes.axvline(len(cases) - 1.5, color=_GRAY, linewidth=0.6)
+        axes.axvline(len(config.data.cases) - 0.5, color=_GRAY, linewidth=0.6)
         axes.grid(visible=False, axis="x")
         axes.yaxis.set_major_locator(FixedLocator(_TICKS))
         axes.yaxis.set_minor_locator(NullLocator())

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import zlib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,11 +11,24 @@ import numpy as np
 from tuning.crossfit import Crossfit, Scored
 from tuning.crossfit_config import CrossfitConfig, Target
 from tuning.crossfit_tiles import Figure, draws_of, figures_of, summarize
+from tuning.cuts import cuts_over
 
-__all__ = ["MEAN", "Row", "Verdict", "final_variants", "is_met", "summary_of", "verdicts"]
+__all__ = [
+    "MEAN",
+    "Row",
+    "Verdict",
+    "cut_texts",
+    "final_variants",
+    "is_met",
+    "mean_names",
+    "summary_of",
+    "verdicts",
+]
 
 MEAN = "mean"
 """Stands for the name of a case in the means over all of them."""
+
+_Drawn = Mapping[tuple[str, str], Mapping[str, np.ndarray]]  # by filter and variant, by figure
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -74,25 +87,43 @@ def summary_of(config: CrossfitConfig, found: Crossfit) -> list[Row]:
         config: The crossfit.
         found: What `run_crossfit` returned.
     """
-    rows, values = [], {}
-    for case in config.data.cases:
-        own = [one for one in found.scored if one.case == case]
-        line = next(one for one in own if one.filter == "line" and one.variant == "default")
-        draws = draws_of(len(line.sums), config.bootstrap, [zlib.crc32(case.encode())])
-        for one in own:
-            values[case, _key(one)] = figures_of(one.sums, line.sums, draws)
-            rows.append(_row(config, case, _key(one), values[case, _key(one)]))
-    for key in dict.fromkeys(_key(one) for one in found.scored):
-        every = [values[case, key] for case in config.data.cases if (case, key) in values]
-        if len(every) == len(config.data.cases):
-            # A case without an own figure, such as one without a band, does not count.
-            known = {
-                name: [one[name] for one in every if np.isfinite(one[name][0])] for name in every[0]
-            }
-            nothing = np.full_like(every[0]["flip"], np.nan)
-            means = {n: np.mean(some, axis=0) if some else nothing for n, some in known.items()}
-            rows.append(_row(config, MEAN, key, means))
-    return rows
+    cases = {case: _drawn(config, found, case) for case in config.data.cases}
+    rows = [
+        _row(config, case, key, values)
+        for case, filters in cases.items()
+        for key, values in filters.items()
+    ]
+    heights = sorted({lines for one in found.scored for lines in one.heights}, reverse=True)
+    for lines in heights if len(heights) > 1 else ():
+        parts = [_drawn(config, found, case, lines) for case in config.data.cases]
+        rows += _means(config, f"{MEAN}, {lines} lines", [part for part in parts if part])
+    return rows + _means(config, MEAN, list(cases.values()))
+
+
+def mean_names(config: CrossfitConfig, rows: Sequence[Row]) -> tuple[str, ...]:
+    """Return what stands for the name of a case in means: of each height if several, then of all.
+
+    Args:
+        config: The crossfit.
+        rows: What `summary_of` returned.
+    """
+    return tuple(dict.fromkeys(row.case for row in rows if row.case not in config.data.cases))
+
+
+def cut_texts(config: CrossfitConfig, found: Crossfit) -> list[str]:
+    """Return what each filter cuts short, as it is judged, a sentence each; nothing if nothing.
+
+    Args:
+        config: The crossfit.
+        found: What `run_crossfit` returned.
+    """
+    texts = []
+    for name, variant in final_variants(config, found).items():
+        every = [s for s in found.scored if (s.filter, s.variant) == (name, variant)]
+        cuts = cuts_over([cut for one in every for cut in one.cuts])
+        if cuts is not None:
+            texts.append(f"{name} {variant}: {cuts.text('frames')}.")
+    return texts
 
 
 def final_variants(config: CrossfitConfig, found: Crossfit) -> dict[str, str]:
@@ -143,6 +174,35 @@ def _is_sure(target: Target, figure: Figure, limit: float) -> bool:
     if figure.low is None or figure.high is None:
         return False
     return is_met(target, figure.low, limit) == is_met(target, figure.high, limit)
+
+
+def _drawn(config: CrossfitConfig, found: Crossfit, case: str, lines: int | None = None) -> _Drawn:
+    """Return a case's figures at each draw by filter and variant; of one height's frames alone."""
+    own = {
+        _key(one): one.sums if lines is None else one.heights[lines]
+        for one in found.scored
+        if one.case == case and (lines is None or lines in one.heights)
+    }
+    if not own:
+        return {}
+    line = own["line", "default"]
+    seed = [zlib.crc32(case.encode()), *([] if lines is None else [lines])]
+    draws = draws_of(len(line), config.bootstrap, seed)
+    return {key: figures_of(sums, line, draws) for key, sums in own.items()}
+
+
+def _means(config: CrossfitConfig, name: str, cases: Sequence[_Drawn]) -> list[Row]:
+    """Return the means over cases of each filter that all of them have."""
+    rows = []
+    for key in dict.fromkeys(key for filters in cases for key in filters):
+        every = [filters[key] for filters in cases if key in filters]
+        if len(every) == len(cases):
+            # A case without an own figure, such as one without a band, does not count.
+            known = {n: [one[n] for one in every if np.isfinite(one[n][0])] for n in every[0]}
+            nothing = np.full_like(every[0]["flip"], np.nan)
+            means = {n: np.mean(some, axis=0) if some else nothing for n, some in known.items()}
+            rows.append(_row(config, name, key, means))
+    return rows
 
 
 def _key(one: Scored) -> tuple[str, str]:

@@ -56,11 +56,16 @@ class Sums:
             the same with "_band": the sums over a tile's pixels, (T,).
     """
 
-    def __init__(self, arrays: Mapping[str, Sequence[float]]) -> None:
+    def __init__(self, arrays: Mapping[str, Sequence[float] | _Array]) -> None:
         self.arrays = {name: np.asarray(values, np.float64) for name, values in arrays.items()}
 
     def __len__(self) -> int:
         return len(self.arrays["count"])
+
+    @classmethod
+    def joined(cls, parts: Sequence[Sums]) -> Sums:
+        """Return the sums over the tiles of all parts, of which there is at least one."""
+        return cls({n: np.concatenate([p.arrays[n] for p in parts]) for n in parts[0].arrays})
 
     def plain(self) -> dict[str, list[float]]:
         """Return lists, as JSON has them."""

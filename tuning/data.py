@@ -57,17 +57,16 @@ def load_cases(
         TorchblurError: a file that is missing or cannot be read.
     """
     jobs = [
-        (split, key, item.weight, job)
+        (split, key, item, job)
         for split, items in (("train", spec.train), ("holdout", spec.holdout))
         for key, item in ((f"data.{split}.{i}", item) for i, item in enumerate(items))
         for job in _jobs(Path(spec.root), item, key)
     ]
     cases: list[AnyCase] = []
-    for index, (split, key, weight, job) in enumerate(jobs):
+    for index, (split, key, item, job) in enumerate(jobs):
         if report is not None:
             report(index, len(jobs), job.name)
-        case = job.load(split).to(device)
-        cases.append(dataclasses.replace(case, item=key, weight=weight))
+        cases.append(_of_item(job.load(split).to(device), key, item))
     refuse_repeats(cases)
     return with_unique_names(cases)
 
@@ -81,8 +80,17 @@ def draw_cases(root: str, key: str, item: FamilyData | FamilyStreamData) -> list
         item: Which scenes, and how they are rendered.
     """
     jobs = _jobs(Path(root), item, key)
-    cases = [job.load("train") for job in jobs]
-    return [dataclasses.replace(case, item=key, weight=item.weight) for case in cases]
+    return [_of_item(job.load("train"), key, item) for job in jobs]
+
+
+def _of_item(case: AnyCase, key: str, item: DataItem) -> AnyCase:
+    """Return a case that knows which item it comes from, and of how large an image it is."""
+    if item.lines is not None and item.lines < case.size[0]:
+        raise ConfigError(
+            f"`lines` is the height of the whole image and must be at least the frame's, "
+            f"{case.size[0]} px, got {item.lines} ({key}.lines: {case.name})"
+        )
+    return dataclasses.replace(case, item=key, weight=item.weight, of_lines=item.lines)
 
 
 # -- one case --------------------------------------------------------------------------------------

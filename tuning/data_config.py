@@ -5,11 +5,19 @@ from __future__ import annotations
 import itertools
 from typing import Annotated, Any, Literal
 
-from pydantic import AfterValidator, BeforeValidator, Field, field_validator, model_validator
+from pydantic import (
+    AfterValidator,
+    BeforeValidator,
+    Field,
+    SerializerFunctionWrapHandler,
+    field_validator,
+    model_serializer,
+    model_validator,
+)
 
 from torchblur.frame import LONGEST_SHUTTER, Shutter, ShutterPosition
 from torchblur.params import Config
-from tuning.framing_config import Framed, read_size, refusal
+from tuning.framing_config import Framed, read_size, refusal, without_none
 
 __all__ = [
     "Crops",
@@ -98,7 +106,21 @@ class FamilyData(_Drawn, _Rendered):
     kind: Literal["family"]
 
 
-class ExrData(_Exposed, _Weighted):
+class _Filed(_Exposed, _Weighted):
+    """Frames that are read."""
+
+    lines: Annotated[int, Field(ge=1)] | None = Field(
+        None,
+        description="height in px of the camera's whole image, if the files are windows of it; "
+        "figures are told apart by it",
+    )
+
+    @model_serializer(mode="wrap")
+    def _without_none(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        return without_none(handler(self), ("lines",))
+
+
+class ExrData(_Filed):
     """Frames of another renderer, as EXR files in one folder."""
 
     kind: Literal["exr"]
@@ -179,7 +201,7 @@ class FamilyStreamData(_Drawn, _RenderedStream):
     kind: Literal["family_stream"]
 
 
-class ExrStreamData(_Stream):
+class ExrStreamData(_Stream, _Filed):
     """A sequence of another renderer: samples with their times and references, as EXR files."""
 
     kind: Literal["exr_stream"]
@@ -228,7 +250,8 @@ class Crops(Config):
     context: int | None = Field(
         None,
         ge=0,
-        description="px around it that are filtered and not scored; twice the tile if left out",
+        description="px around it that are filtered and not scored; if left out twice the tile, or "
+        "with `reach: frame` the longest blur to each side and a tile",
     )
     choose: Literal["motion", "error"] = Field(
         "motion",

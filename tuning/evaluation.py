@@ -18,7 +18,7 @@ from tuning.progress import Stage
 from tuning.result import CaseScore
 from tuning.sequence_scores import finite_or_none, noisy_frames, score_frames
 from tuning.space import Space
-from tuning.variants import Variant, render, render_frames
+from tuning.variants import Variant, cut_of, render, render_frames
 from tuning.windows import make_samples
 
 __all__ = ["ceiling", "noise_scores", "score_cases", "score_image", "score_variant"]
@@ -50,8 +50,13 @@ def score_cases(
 def score_variant(case: AnyCase, variant: Variant) -> CaseScore:
     """Return the figures of a variant on a case."""
     if isinstance(case, SequenceCase):
-        return score_frames(case, variant.name, render_frames(variant, case))
-    return score_image(case, variant.name, render(variant, case))
+        score = score_frames(case, variant.name, render_frames(variant, case))
+    else:
+        score = score_image(case, variant.name, render(variant, case))
+    cut = cut_of(variant, case)
+    if cut is None:
+        return score
+    return score.model_copy(update={"cut": cut.share, "longest": cut.longest})
 
 
 def noise_scores(case: Case) -> CaseScore:
@@ -118,4 +123,5 @@ def score_image(case: Case, variant: str, image: Tensor) -> CaseScore:
         split="train" if case.split == "train" else "holdout",
         variant=variant,
         scores={name: finite_or_none(float(value)) for name, value in figures.items()},
+        lines=case.lines,
     )

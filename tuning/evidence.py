@@ -7,7 +7,7 @@ from typing import Any
 
 from tuning.cases import AnyCase
 from tuning.objective_config import ObjectiveSpec
-from tuning.result import FitResult
+from tuning.result import FitResult, height_name
 
 __all__ = ["evidence_of"]
 
@@ -39,13 +39,19 @@ def evidence_of(
         variants: Names of the images whose figures are given.
         **found: What is said of this preset alone; it stands before the figures.
     """
+    groups = {"train": (None,), "holdout": result.height_groups()}
     figures = {
-        split: {
-            variant: {m: v for m in _HEADLINE if (v := result.mean(variant, split, m)) is not None}
-            for variant in variants
+        split if lines is None else f"{split}, {height_name(lines)}": {
+            name: _figures(result, name, split, lines) for name in variants
         }
-        for split in ("train", "holdout")
+        for split, heights in groups.items()
         if any(case.split == split for case in cases)
+        for lines in heights
+    }
+    cuts = {
+        name: cut._asdict()
+        for name in variants
+        if (cut := result.cuts(name, "holdout")) is not None
     }
     return {
         "train": [case.name for case in cases if case.split == "train"],
@@ -53,7 +59,13 @@ def evidence_of(
         "objective": objective.model_dump(mode="json"),
         **found,
         "figures": figures,
+        **({"cut": cuts} if cuts else {}),
         "seed": result.seed,
         "command": result.command,
         "versions": result.versions,
     }
+
+
+def _figures(result: FitResult, variant: str, split: str, lines: int | None) -> dict[str, float]:
+    means = {metric: result.mean(variant, split, metric, lines) for metric in _HEADLINE}
+    return {metric: value for metric, value in means.items() if value is not None}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from abc import abstractmethod
+from collections.abc import Collection
 from typing import Annotated, Any, Literal
 
 from pydantic import (
@@ -18,7 +19,7 @@ from pydantic_core import PydanticCustomError
 
 from torchblur.params import Config
 
-__all__ = ["Framed", "read_size", "refusal"]
+__all__ = ["Framed", "read_size", "refusal", "without_none"]
 
 
 def refusal(text: str) -> PydanticCustomError:
@@ -40,6 +41,16 @@ def read_size(text: str, key: str) -> tuple[int, int]:
     if match is None:
         raise refusal(f"`{key}` must be WIDTHxHEIGHT in px, got {text!r}")
     return int(match[2]), int(match[1])
+
+
+def without_none(data: dict[str, Any], names: Collection[str]) -> dict[str, Any]:
+    """Return data without what is not given: runs and files that know of no such key stay valid.
+
+    Args:
+        data: What a model is written as.
+        names: Keys that are left out where they are None.
+    """
+    return {key: value for key, value in data.items() if value is not None or key not in names}
 
 
 def _place(value: Any) -> Any:
@@ -91,12 +102,7 @@ class Framed(Config):
 
     @model_serializer(mode="wrap")
     def _without_none(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        """Leave out what is not given: runs and files that know of no windows stay valid."""
-        data: dict[str, Any] = handler(self)
-        for name in ("of", "at"):
-            if getattr(self, name) is None:
-                data.pop(name, None)
-        return data
+        return without_none(handler(self), ("of", "at"))
 
     @property
     @abstractmethod
@@ -107,6 +113,11 @@ class Framed(Config):
     def whole(self) -> tuple[int, int] | None:
         """Height and width of the whole image, px, if a window of one is rendered."""
         return None if self.of is None else read_size(self.of, "of")
+
+    @property
+    def lines(self) -> int | None:
+        """Height of the whole image, px, if a window of one is rendered."""
+        return None if self.whole is None else self.whole[0]
 
     @property
     def suffix(self) -> str:

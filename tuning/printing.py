@@ -30,7 +30,8 @@ from tuning.console import (
 )
 from tuning.outputs import State
 from tuning.pareto_report import preset_names
-from tuning.result import FitResult
+from tuning.reach_advice import SHUTTER, reach_advice
+from tuning.result import FitResult, cut_text, height_name
 
 __all__ = [
     "print_ablation",
@@ -181,6 +182,8 @@ def _facts(found: Inspection) -> Iterable[tuple[str, str]]:
             f"{speed.moving_share:.1%} of the pixels move: median {speed.median:.1f}, 95 % "
             f"{speed.percentile_95:.1f}, greatest {speed.maximum:.1f} px/frame",
         )
+        if speed.moving_share > 0:
+            yield f"at shutter {SHUTTER:g}", reach_advice(speed.percentiles)
     if found.time is not None and found.time.is_stream:
         times = found.time
         yield (
@@ -232,9 +235,14 @@ def print_batch(plan: Plan, result: BatchResult) -> None:
 def print_fit(result: FitResult, folder: Path) -> None:
     """Print a fit's figures on training frames and hold-out, its parameters, and its files."""
     presets = preset_names(result)
-    for split, title in (("train", "training frames"), ("holdout", "hold-out")):
-        shown = (*_SHOWN[:-3], *presets, *_SHOWN[-3:])
-        rows = {name: _means(result, name, split) for name in shown if name in result.variants()}
+    shown = [n for n in (*_SHOWN[:-3], *presets, *_SHOWN[-3:]) if n in result.variants()]
+    heights = result.height_groups()
+    tables = {"training frames": ("train", None)} | {
+        "hold-out" if len(heights) == 1 else f"hold-out, {height_name(lines)}": ("holdout", lines)
+        for lines in heights
+    }
+    for title, (split, lines) in tables.items():
+        rows = {name: _means(result, name, split, lines) for name in shown}
         rows = {name: row for name, row in rows.items() if row["flip"] == row["flip"]}
         if rows:
             results.print(metrics_table(title, rows, highlight="tuned", unranked=_BOUNDS))
@@ -243,7 +251,8 @@ def print_fit(result: FitResult, folder: Path) -> None:
         unit = "" if row.unit == "1" else row.unit
         table.add_row(Text(row.name), _plain_short(row.default), _plain_short(row.tuned), unit)
     results.print(table)
-    for note in result.notes:
+    cut = cut_text(result, "tuned")
+    for note in (*result.notes, *([f"Tuned: {cut}"] if cut else [])):
         log(f"note: {note}")
     results.print(f"preset: {folder / 'preset.yaml'}", soft_wrap=True)
     if presets:
@@ -252,9 +261,9 @@ def print_fit(result: FitResult, folder: Path) -> None:
     results.print(f"report: {folder / 'report.html'}", soft_wrap=True)
 
 
-def _means(result: FitResult, variant: str, split: str) -> dict[str, float]:
+def _means(result: FitResult, variant: str, split: str, lines: int | None) -> dict[str, float]:
     keys = _OF_SEQUENCES if any(score.frames for score in result.scores) else _SCORES
-    means = {key: result.mean(variant, split, key) for key in keys}
+    means = {key: result.mean(variant, split, key, lines) for key in keys}
     return {key: float("nan") if value is None else value for key, value in means.items()}
 
 

@@ -18,13 +18,28 @@ from tuning.config import TuneConfig
 from tuning.page import Column, Row, Table, View, make_view, render_page
 from tuning.pareto_report import front_section, preset_names
 from tuning.plots import loss_curves, parameter_paths
-from tuning.result import FitResult, MethodResult, ParameterResult
+from tuning.result import (
+    CaseScore,
+    FitResult,
+    MethodResult,
+    ParameterResult,
+    cut_text,
+    height_name,
+    worse_text,
+)
 from tuning.runfolder import RunFolder
 from tuning.sensitivity_rows import slope_rows
 from tuning.sequence_plots import score_curves
 from tuning.variants import Variant, render, render_frames
 
-__all__ = ["Verdict", "default_label", "figures_table", "verdict_of", "write_report"]
+__all__ = [
+    "Verdict",
+    "default_label",
+    "figures_table",
+    "figures_tables",
+    "verdict_of",
+    "write_report",
+]
 
 _MAX_VIEWS = 8
 _METRICS = {
@@ -105,8 +120,8 @@ def write_report(
         result=result,
         train_text=_counted([case for case in cases if case.split == "train"]),
         verdict=verdict_of(result),
-        notes=result.notes,
-        tables=[t for split in ("holdout", "train") if (t := figures_table(result, split))],
+        notes=(*result.notes, *([f"Tuned: {cut}"] if (cut := cut_text(result, "tuned")) else [])),
+        tables=figures_tables(result),
         explanations=[text for n, text in _EXPLAINED.items() if n in result.variants()],
         front=front_section(result),
         views=views,
@@ -144,6 +159,8 @@ def verdict_of(result: FitResult) -> Verdict:
     if line is not None:
         beaten = "beats" if after < line else "does not beat"
         text += f". The tuned filter {beaten} a plain line blur (FLIP {line:.4f})"
+    if len(result.heights("holdout")) > 1 and (worse := worse_text(result, "tuned")):
+        text += f". {worse.removesuffix('.')}"
     return Verdict(after < before, text + ".")
 
 
@@ -159,27 +176,35 @@ def default_label(kind: str) -> str:
     return "as published" if get_filter(kind).published else "with its defaults"
 
 
-def figures_table(result: FitResult, split: str) -> Table | None:
+def figures_tables(result: FitResult) -> list[Table]:
+    """Return the means of all variants: over the hold-out, at each of its heights, and training."""
+    groups = [("holdout", lines) for lines in result.height_groups()]
+    tables = [figures_table(result, *group) for group in (*groups, ("train", None))]
+    return [table for table in tables if table is not None]
+
+
+def figures_table(result: FitResult, split: str, lines: int | None = None) -> Table | None:
     """Return the means of all variants over a split, or None if it has no frames.
 
     Args:
         result: A fit's result.
         split: "train" or "holdout".
+        lines: One of the heights of its images; over all of them if left out.
     """
-    scores = [score for score in result.scores if score.split == split]
+    scores = [s for s in result.scores if s.split == split and lines in (None, s.lines)]
     columns = dict(_METRICS)
     if any(score.frames for score in scores):
         columns |= _OF_SEQUENCES
     rows = [
         Row(
             name=variant,
-            values=[result.mean(variant, split, metric) for metric in columns],
+            values=[result.mean(variant, split, metric, lines) for metric in columns],
             note=default_label(result.filter) if variant == "default" else _NOTES.get(variant, ""),
             ranked=variant not in _UNRANKED,
             strong=variant == "tuned",
         )
         for variant in result.variants()
-        if result.mean(variant, split, "flip") is not None
+        if result.mean(variant, split, "flip", lines) is not None
     ]
     if not rows:
         return None
@@ -187,7 +212,9 @@ def figures_table(result: FitResult, split: str) -> Table | None:
         _count(len({score.case for score in scores if bool(score.frames) == several}), name)
         for several, name in ((False, "frame"), (True, "sequence"))
     ]
-    title = f"{_SPLITS[split]}: {' and '.join(text for text in counted if text)}"
+    is_part = split == "holdout" and len(result.height_groups()) > 1
+    where = f", {height_name(lines)}" if is_part else ""
+    title = f"{_SPLITS[split]}{where}: {' and '.join(text for text in counted if text)}"
     return Table(title=title, columns=list(columns.values()), rows=rows)
 
 
@@ -341,22 +368,30 @@ def _paths(result: FitResult, records: Sequence[dict[str, Any]]) -> list[tuple[s
 
 
 def _case_table(result: FitResult) -> Table:
-    by_case: dict[str, dict[str, dict[str, float | None]]] = {}
-    splits = {score.case: score.split for score in result.scores}
+    by_case: dict[str, dict[str, CaseScore]] = {}
     for score in result.scores:
-        by_case.setdefault(score.case, {})[score.variant] = score.scores
+        by_case.setdefault(score.case, {})[score.variant] = score
+    shown = {"flip": ("FLIP", 4), "psnr": ("PSNR", 2), "flip_band": ("FLIP, borders", 4)}
+    both = ("default", "tuned")
+    if any(result.cuts(name, split) for name in both for split in _SPLITS):
+        shown["cut"] = ("cut, %", 1)
     rows = []
     for case, variants in by_case.items():
-        values: list[float | None] = []
-        for metric in ("flip", "psnr", "flip_band"):
-            values += [variants["default"][metric], variants["tuned"][metric]]
-        rows.append(Row(name=case, values=values, note=_SPLITS[splits[case]].lower()))
+        values = [_case_figure(variants[name], metric) for metric in shown for name in both]
+        note = _SPLITS[variants["tuned"].split].lower()
+        rows.append(Row(name=case, values=values, note=note))
     columns = [
         Column(name=f"{label} {what}", digits=digits)
-        for label, digits in (("FLIP", 4), ("PSNR", 2), ("FLIP, borders", 4))
+        for label, digits in shown.values()
         for what in ("before", "after")
     ]
     return Table(title="", columns=columns, rows=rows)
+
+
+def _case_figure(score: CaseScore, metric: str) -> float | None:
+    if metric == "cut":
+        return None if score.cut is None else 100 * score.cut
+    return score.scores[metric]
 
 
 def _short(value: Any) -> str:

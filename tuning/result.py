@@ -10,6 +10,7 @@ from pydantic import Field
 
 from torchblur.errors import ConfigError
 from torchblur.params import Config, build
+from tuning.cuts import Cuts, cuts_over
 from tuning.pareto_result import ParetoResult
 
 __all__ = [
@@ -20,6 +21,9 @@ __all__ = [
     "ParameterResult",
     "SensitivityResult",
     "StartResult",
+    "cut_text",
+    "height_name",
+    "worse_text",
 ]
 
 Split = Literal["train", "holdout"]
@@ -128,6 +132,13 @@ class CaseScore(Config):
     means over its scored frames, and flip_median and temporal beside them."""
     frames: tuple[FrameScore, ...] = ()
     """Of a sequence: its frames in order."""
+    lines: int | None = None
+    """Height of the camera's whole image, px; null in results that do not say it."""
+    cut: float | None = None
+    """Share of the pixels that move farther than the filter blurs, of a sequence the mean; null
+    where there is no such limit."""
+    longest: float | None = None
+    """Longest half spread of the case, px; null where `cut` is."""
 
 
 class FitResult(Config):
@@ -149,7 +160,7 @@ class FitResult(Config):
     versions: dict[str, str]
     seconds: float
 
-    def mean(self, variant: str, split: str, metric: str) -> float | None:
+    def mean(self, variant: str, split: str, metric: str, lines: int | None = None) -> float | None:
         """Return the mean of a metric over the cases of a split, or None if there is none.
 
         Args:
@@ -157,12 +168,14 @@ class FitResult(Config):
             split: "train" or "holdout".
             metric: "flip", "psnr", "ssim", "flip_band" …; of sequences also "flip_median" and
                 "temporal"
+            lines: Over the cases of this height alone.
         """
         values = [
             value
             for score in self.scores
             if score.variant == variant
             and score.split == split
+            and lines in (None, score.lines)
             and (value := score.scores.get(metric)) is not None
         ]
         return sum(values) / len(values) if values else None
@@ -170,6 +183,47 @@ class FitResult(Config):
     def variants(self) -> tuple[str, ...]:
         """Return the names of what was scored, in order."""
         return tuple(dict.fromkeys(score.variant for score in self.scores))
+
+    def heights(self, split: str) -> tuple[int, ...]:
+        """Return the heights of the cameras' images of a split, px, the tallest first."""
+        known = {s.lines for s in self.scores if s.split == split and s.lines is not None}
+        return tuple(sorted(known, reverse=True))
+
+    def height_groups(self) -> tuple[int | None, ...]:
+        """Return the heights that figures of the hold-out are given for, the tallest first.
+
+        Returns:
+            Of several heights each, and None for all cases together; of one height None alone.
+        """
+        heights = self.heights("holdout")
+        return (*heights, None) if len(heights) > 1 else (None,)
+
+    def worse_than_line(self, variant: str) -> list[tuple[int | None, float, float]]:
+        """Return at which heights of the hold-out a variant's FLIP is above that of `line`.
+
+        Args:
+            variant: As in `CaseScore.variant`.
+
+        Returns:
+            Height (None where it is not known), the variant's FLIP, and that of `line`; what four
+            digits do not show does not count.
+        """
+        found = []
+        for lines in self.heights("holdout") or (None,):
+            own, line = (self.mean(name, "holdout", "flip", lines) for name in (variant, "line"))
+            if own is not None and line is not None and round(own, 4) > round(line, 4):
+                found.append((lines, own, line))
+        return found
+
+    def cuts(self, variant: str, split: str) -> Cuts | None:
+        """Return what a variant cuts short of the cases of a split, or None if nothing.
+
+        Args:
+            variant: As in `CaseScore.variant`.
+            split: "train" or "holdout".
+        """
+        scores = [s for s in self.scores if (s.variant, s.split) == (variant, split)]
+        return cuts_over([(score.cut or 0.0, score.longest or 0.0) for score in scores])
 
     @classmethod
     def load(cls, path: Path) -> FitResult:
@@ -183,3 +237,41 @@ class FitResult(Config):
         except (OSError, ValueError) as error:
             raise ConfigError(f"{path} is no result of a fit: {error}") from error
         return build(cls, data, str(path))
+
+
+def cut_text(result: FitResult, variant: str) -> str:
+    """Return what a variant cuts short of the hold-out, or of what was fitted, in a sentence.
+
+    Args:
+        result: A fit's result.
+        variant: As in `CaseScore.variant`.
+
+    Returns:
+        The sentence, or nothing if nothing is cut of either.
+    """
+    for split, frames in (("holdout", "hold-out frames"), ("train", "training frames")):
+        cuts = result.cuts(variant, split)
+        if cuts is not None:
+            text = cuts.text(frames)
+            return f"{text[0].upper()}{text[1:]}."
+    return ""
+
+
+def height_name(lines: int | None) -> str:
+    """Return what a height of `FitResult.height_groups` is called."""
+    return "all heights" if lines is None else f"{lines} lines"
+
+
+def worse_text(result: FitResult, variant: str) -> str:
+    """Return where a variant is worse than a line blur on the hold-out, or nothing if nowhere.
+
+    Args:
+        result: A fit's result.
+        variant: As in `CaseScore.variant`.
+    """
+    found = [
+        f"{'on the hold-out' if lines is None else f'at {height_name(lines)}'} "
+        f"({own:.4f} against {line:.4f})"
+        for lines, own, line in result.worse_than_line(variant)
+    ]
+    return f"Worse than a line blur {' and '.join(found)}." if found else ""

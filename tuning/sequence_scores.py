@@ -41,6 +41,7 @@ def score_frames(case: SequenceCase, variant: str, images: Sequence[Tensor]) -> 
         split="train" if case.split == "train" else "holdout",
         variant=variant,
         scores=mean_of_frames(figures[first:]),
+        lines=case.lines,
         frames=tuple(
             FrameScore(label=label, scored=index >= first, scores=scores)
             for index, (label, scores) in enumerate(zip(case.labels, figures, strict=True))

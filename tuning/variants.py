@@ -10,10 +10,11 @@ import torch
 from torch import Tensor
 
 from torchblur.filters import BlurFilter
+from torchblur.filters.reach import Cut, ReachingBlur
 from tuning.blurring import arguments, blurred, blurred_sequence
 from tuning.cases import AnyCase, Case, SequenceCase
 
-__all__ = ["Variant", "render", "render_frames"]
+__all__ = ["Variant", "cut_of", "render", "render_frames"]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -72,3 +73,20 @@ def render_frames(variant: Variant, case: SequenceCase) -> list[Tensor]:
         case.references[0].device,
     )
     return list(blurred_sequence(blur, case.steps(blur), case.cuts, given))
+
+
+def cut_of(variant: Variant, case: AnyCase) -> Cut | None:
+    """Return how much of a case moves farther than a variant blurs, or None if it has no limit.
+
+    Of a sequence: the mean share, and the longest half spread.
+    """
+    blur = variant.blur
+    if not isinstance(blur, ReachingBlur):
+        return None
+    frames = [frame for step in case.steps(blur) for frame in step]
+    shutter, device = case.shutter, frames[0].device
+    values = variant.values or {}
+    given = arguments(shutter.open, shutter.position, values, variant.free, device)
+    cuts = [blur.cut(frame, **given) for frame in frames]
+    share = sum(cut.share for cut in cuts) / len(cuts)
+    return Cut(share, max(cut.longest for cut in cuts), cuts[0].reach)

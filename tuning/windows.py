@@ -11,6 +11,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from torchblur.filters import BlurFilter
+from torchblur.filters.reach import ReachingBlur
 from torchblur.frame import Frame, Shutter
 from tuning.cases import AnyCase, Case
 from tuning.data_config import Crops
@@ -125,17 +126,20 @@ def make_samples(
         tile_size: Tile of the filter, px.
         seed: Of the places.
         blur: The filter that is fitted, with its start values: it decides which frames of a
-            sequence it takes, see `SequenceCase.steps`, and where its error is. Without one the
-            error is that of a blur along the pixel's own velocity.
+            sequence it takes, see `SequenceCase.steps`, where its error is, and, if it reaches as
+            far as the frame moves, how wide the context is. Without one the error is that of a
+            blur along the pixel's own velocity.
     """
     generator = torch.Generator().manual_seed(seed)
     places = [_places(case, crops, generator, blur) for case in cases]
     weights = window_weights(cases, [len(some) for some in places])
-    return [
-        _cut_out(case, _box(case.size, place, crops, tile_size), blur, weight * place.weight)
-        for case, some, weight in zip(cases, places, weights, strict=True)
-        for place in some
-    ]
+    samples = []
+    for case, some, weight in zip(cases, places, weights, strict=True):
+        context = _context(case, crops, tile_size, blur)
+        for place in some:
+            box = _box(case.size, place, crops, tile_size, context)
+            samples.append(_cut_out(case, box, blur, weight * place.weight))
+    return samples
 
 
 @dataclass(frozen=True)
@@ -218,12 +222,28 @@ def _places(
     ]
 
 
-def _box(size: tuple[int, int], place: _Place, crops: Crops | None, tile_size: int) -> _Box:
+def _context(case: AnyCase, crops: Crops | None, tile_size: int, blur: BlurFilter | None) -> int:
+    """Return how many px around a window are filtered and not scored."""
+    if crops is None:
+        return 0
+    if crops.context is not None:
+        return crops.context
+    if not isinstance(blur, ReachingBlur) or getattr(blur.config, "reach", "tile") == "tile":
+        return 2 * tile_size
+    given = {"shutter": case.shutter.open, "shutter_position": case.shutter.position}
+    cuts = [blur.cut(frame, **given) for step in case.steps(blur) for frame in step]
+    reach = max(min(cut.longest, cut.reach) for cut in cuts)
+    # Taps of a shutter that is not centered lie on one side, twice as far from the pixel.
+    return math.ceil(reach * (1 + abs(case.shutter.center))) + tile_size
+
+
+def _box(
+    size: tuple[int, int], place: _Place, crops: Crops | None, tile_size: int, context: int
+) -> _Box:
     if crops is None:
         return _Box((0, 0, *size), (0, 0, *size))
     top, left = place.top, place.left
     height, width = (min(crops.size, edge) for edge in size)
-    context = 2 * tile_size if crops.context is None else crops.context
     outer_top, outer_height = _outer(top, height, size[0], context, tile_size)
     outer_left, outer_width = _outer(left, width, size[1], context, tile_size)
     return _Box(

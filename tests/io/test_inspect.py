@@ -53,6 +53,9 @@ def test_a_good_file_has_no_warnings_and_all_facts(tmp_path):
     assert found.velocity.median == pytest.approx(401**0.5)
     assert found.velocity.percentile_95 == pytest.approx(401**0.5)
     assert found.velocity.maximum == pytest.approx(901**0.5)
+    assert len(found.velocity.percentiles) == 101
+    ends = [found.velocity.percentiles[percent] for percent in (0, 99, 100)]
+    assert ends == pytest.approx([0, 401**0.5, 901**0.5])
     assert found.velocity.moving_share == pytest.approx(0.5)
     assert json.loads(json.dumps(found.as_dict()))["velocity"]["moving_share"] == 0.5
 

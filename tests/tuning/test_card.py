@@ -1,6 +1,7 @@
 """Cards of presets: figures of the run and nothing else, honest about what is worse."""
 
 import io
+import re
 from dataclasses import replace
 
 import pytest
@@ -72,10 +73,10 @@ def section(text, title):
     return text.split(f"## {title}\n")[1].split("\n## ")[0]
 
 
-def scored(case, split="holdout", **by_variant):
+def scored(case, split="holdout", lines=None, **by_variant):
     """Return scores of a case: figures of a variant differ from FIGURES as given."""
     return [
-        CaseScore(case=case, split=split, variant=name, scores=FIGURES | changes)
+        CaseScore(case=case, split=split, variant=name, scores=FIGURES | changes, lines=lines)
         for name, changes in by_variant.items()
     ]
 
@@ -105,6 +106,42 @@ def test_the_card_has_the_figures_of_the_run(run, tmp_path):
     assert "| hold-out | exr | `second` | all |  |  | 1, centered |  |" in made
     assert "Objective: terms {mse: 1}, color_space linear." in made
     assert f"{result.start_objective:.5f} → {result.objective:.5f}" in made
+
+
+class TestHeights:
+    def lines(self, run, *scores):
+        """Return the first paragraphs and the titles of the tables."""
+        text = card_text(card_of(run, scores=scores), "p", "i", "")
+        head = text.split("```")[0].split("\n\n")[1:-1]
+        return head, re.findall(r"^(.*); means\.", section(text, "Before and after"), re.MULTILINE)
+
+    def test_worse_than_a_line_blur_is_said_first(self, run):
+        better = scored("a", lines=1080, default={}, line={}, tuned={"flip": 0.01})
+        worse = scored("b", lines=136, default={}, line={}, tuned={"flip": 0.03})
+        train = scored("c", "train", lines=136, default={}, line={}, tuned={})
+        (first, summary), titles = self.lines(run, *better, *worse, *train)
+        assert first == "**Worse than a line blur at 136 lines (0.0300 against 0.0200).**"
+        assert summary.endswith("references of 136 lines and held out at 1080 and 136 lines.")
+        assert titles == [
+            "Hold-out, 1080 lines: 1 frame",
+            "Hold-out, 136 lines: 1 frame",
+            "Hold-out, all heights: 2 frames",
+            "Training: 1 frame",
+        ]
+
+    def test_nothing_where_it_is_not(self, run):
+        (summary,), titles = self.lines(
+            run, *scored("a", lines=136, default={}, line={}, tuned={"flip": 0.020049})
+        )
+        assert summary.endswith("references and held out at 136 lines.")
+        assert titles == ["Hold-out: 1 frame"]
+
+    def test_results_that_do_not_say_their_height(self, run):
+        (first, summary), _ = self.lines(
+            run, *scored("a", default={}, line={}, tuned={"flip": 0.03})
+        )
+        assert first == "**Worse than a line blur on the hold-out (0.0300 against 0.0200).**"
+        assert summary.endswith("fitted to references.")
 
 
 def test_the_preset_is_that_of_the_run(run, tmp_path):

@@ -14,7 +14,15 @@ from typer.testing import CliRunner
 
 from torchblur.filters import get_filter, registered_filters
 from torchblur.frame import Shutter
-from torchblur.io import read_channels, read_exr, read_frame, read_image, save_yaml, write_image
+from torchblur.io import (
+    read_channels,
+    read_exr,
+    read_frame,
+    read_image,
+    save_yaml,
+    write_frame,
+    write_image,
+)
 from torchblur.metrics import border_band, display_encode, evaluate
 from torchblur.params import declared
 from torchblur.presets import Preset, create_filter, save_preset
@@ -256,6 +264,23 @@ class TestFilter:
         assert "guertin2014" not in done.stdout
         assert len(row(done.stdout, "line")) == 6
 
+    @pytest.mark.filterwarnings("always")
+    def test_what_a_filter_cuts_is_one_line_for_all_frames(self, tmp_path):
+        for number, speed in enumerate((200.0, 220.0, 240.0), start=1):
+            frame = moving_square(speed=speed)
+            write_frame(tmp_path / f"sharp.{number:04d}.exr", frame)
+            write_image(tmp_path / f"reference.{number:04d}.exr", frame.color)
+        given = ("--reference", tmp_path / "reference.####.exr", "--set", "num_samples=5")
+        result = run("filter", "jimenez2014", tmp_path / "sharp.####.exr", *given)
+        told = [line for line in result.stderr.splitlines() if line.startswith("warning")]
+        # One line for the filter, and one for each of those that it is compared with.
+        assert [line.split(":")[1].strip() for line in told] == [
+            "jimenez2014",
+            "mcguire2012",
+            "guertin2014",
+        ]
+        assert all("and are cut there" in line for line in told)
+
     def test_mean_over_a_sequence(self, shot):
         folder = shot[0].parent
         common = ("filter", "line", "--reference", folder / "reference.####.exr")
@@ -412,6 +437,49 @@ class TestInspect:
         assert "warning: " in result.stderr
         assert "no velocity channels" in result.stderr
 
+    @pytest.mark.parametrize(
+        ("columns", "speed", "text"),
+        [
+            (
+                16, 347.0,
+                "longest blur 87 px to each side (99 % of the pixels: 87 px); the default follows "
+                "it; filters of papers need reach=frame or a tile_size of 87 (guertin2014 has 40: "
+                "25 % of the pixels would be cut)",
+            ),
+            (
+                16, 100.0,
+                "longest blur 25 px to each side (99 % of the pixels: 25 px); the default follows "
+                "it; filters of papers need reach=frame or a tile_size of 25 (jimenez2014 has 20: "
+                "25 % of the pixels would be cut)",
+            ),
+            (16, 60.0, "longest blur 15 px to each side (99 % of the pixels: 15 px); all filters"),
+            (
+                16, 3000.0,
+                "the default follows it up to 512 px; all of it needs reach=frame and a max_reach "
+                "of 750",
+            ),
+        ],
+    )  # fmt: skip
+    def test_says_which_reach_it_needs(self, tmp_path, columns, speed, text):
+        velocity = np.zeros((HEIGHT, WIDTH))
+        velocity[:, :columns] = speed
+        write_channels(tmp_path / "a.exr", velocity_X=velocity, velocity_Y=np.zeros_like(velocity))
+        output = run("inspect", tmp_path / "a.exr").stdout
+        (line,) = [line for line in output.splitlines() if line.startswith("at shutter 0.5")]
+        assert text in line
+
+    def test_few_fast_pixels_are_less_than_a_percent(self, tmp_path):
+        velocity = np.zeros((HEIGHT, WIDTH))
+        velocity[0, 0] = 347.0
+        write_channels(tmp_path / "a.exr", velocity_X=velocity)
+        output = run("inspect", tmp_path / "a.exr").stdout
+        assert "(99 % of the pixels: 0 px)" in output
+        assert "guertin2014 has 40: less than 1 % of the pixels" in output
+
+    def test_a_still_frame_needs_no_reach(self, tmp_path):
+        write_channels(tmp_path / "a.exr", velocity_X=np.zeros((HEIGHT, WIDTH)))
+        assert "at shutter" not in run("inspect", tmp_path / "a.exr").stdout
+
     def test_signs_are_tried_with_a_reference(self, shot):
         output = run(
             "inspect", shot[0], "--reference", shot[0].parent / "reference.0001.exr"
@@ -446,6 +514,12 @@ class TestTune:
         assert str(tmp_path / "run/preset.yaml") in output
         assert (tmp_path / "run/report.html").is_file()
         run("filter", tmp_path / "run/preset.yaml", shot[0], "-o", tmp_path / "out.exr")
+
+    @pytest.mark.filterwarnings("always")
+    def test_what_is_cut_is_no_warning(self, config, tmp_path):
+        result = run("tune", config, "-o", tmp_path / "run", "--set", "filter.params.tile_size=2")
+        assert "warning" not in result.stderr
+        assert "are cut" not in result.output
 
     def test_existing_run_is_kept(self, config, tmp_path):
         run("tune", config, "-o", tmp_path / "run")

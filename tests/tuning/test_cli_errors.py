@@ -312,3 +312,20 @@ class TestDebug:
         )
         assert result.exit_code == 0
         assert result.stderr == "warning: something is odd\n"
+
+    def test_what_is_cut_is_told_once_for_each_filter(self, shot, tmp_path, monkeypatch):
+        import warnings
+
+        import tuning.filtering
+        from torchblur.errors import ReachWarning
+
+        def cutting(*args, **kwargs):
+            warnings.simplefilter("always")
+            for text in ("tan2022: 5%", "tan2022: 6%", "sousa2013: 5%"):
+                warnings.warn(text, ReachWarning, stacklevel=1)
+
+        monkeypatch.setattr(tuning.filtering, "filter_files", cutting)
+        result = CliRunner().invoke(
+            app, ["filter", "line", str(shot[0]), "-o", str(tmp_path / "o")]
+        )
+        assert result.stderr == "warning: tan2022: 5%\nwarning: sousa2013: 5%\n"

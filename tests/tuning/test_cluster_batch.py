@@ -2,12 +2,13 @@
 
 import os
 import signal
+import warnings
 
 import pytest
 import torch
 from clusters import threads_cluster
 from planted_sequences import moving_sequence
-from tiny_shots import truncate, with_nan_velocity, write_shot
+from tiny_shots import moving_square, truncate, with_nan_velocity, write_shot
 from typer.testing import CliRunner
 
 import tuning.cluster_batch
@@ -78,6 +79,24 @@ def test_warnings_come_back(cluster, tmp_path):
         )
     assert len(caught) == 1
     assert not result.failures
+
+
+def test_a_cut_is_told_once_whichever_worker_sees_it(cluster, tmp_path):
+    for number, speed in enumerate((40.0, 60.0, 80.0), start=1):
+        write_frame(tmp_path / f"sharp.{number:04d}.exr", moving_square(speed=speed))
+    job = {"filter": "guertin2014", "params": {"num_samples": 5, "tile_size": 4}}
+    save_yaml(
+        tmp_path / "job.yaml", job | {"inputs": ["sharp.####.exr"], "output": "out/", "workers": 3}
+    )
+    for where in ([], ["--scheduler", cluster.client.scheduler.address]):
+        command = ["batch", str(tmp_path / "job.yaml"), "--overwrite", *where]
+        with warnings.catch_warnings():
+            warnings.simplefilter("always")
+            done = CliRunner().invoke(app, command)
+        assert done.exit_code == 0, done.output
+        told = [line for line in done.stderr.splitlines() if line.startswith("warning")]
+        assert len(told) == 1
+        assert "guertin2014: 5% of the pixels move farther than the 4 px" in told[0]
 
 
 def test_a_shot_of_a_filter_with_a_memory_is_one_task(cluster, tmp_path, recall):

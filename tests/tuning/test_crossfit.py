@@ -25,7 +25,7 @@ from tuning.config import TuneConfig
 from tuning.crossfit import run_crossfit
 from tuning.crossfit_config import Bootstrap, load_crossfit_config
 from tuning.crossfit_files import write_crossfit
-from tuning.crossfit_summary import MEAN, final_variants, is_met, summary_of, verdicts
+from tuning.crossfit_summary import MEAN, final_variants, is_met, mean_names, summary_of, verdicts
 from tuning.crossfit_tiles import GAINS, METRICS, Figure, Sums, draws_of, figures_of, summarize
 from tuning.preparation import prepare
 
@@ -307,6 +307,78 @@ class TestBootstrap:
         whole = figures_of(sums, sums, np.ones((1, 12)))
         figure = finished.row("one", "sharp", "").figures["flip"]
         assert whole["flip"][0] == pytest.approx(figure.value, rel=1e-6)
+
+
+@pytest.fixture(scope="module")
+def several(finished):
+    """Case "one" is of 48 lines, "three" of 1080, "two" has a frame of each."""
+
+    def change(data):
+        data["data"]["cases"] = {
+            "one": [item("one")],
+            "two": [item("two", frames=[1]), item("two", frames=[2], lines=1080)],
+            "three": [item("three", lines=1080)],
+        }
+        data["filters"].pop("guertin")
+
+    config = loaded(finished.root, change, "heights.yaml")
+    found = run_crossfit(config, finished.root / "heights")
+    return config, found, summary_of(config, found)
+
+
+class TestHeights:
+    def test_means_of_each_height_then_of_all(self, finished, several):
+        config, found, rows = several
+        assert mean_names(config, rows) == ("mean, 1080 lines", "mean, 48 lines", "mean")
+        flips = {r.case: r.figures["flip"].value for r in rows if r.label == "mcguire given"}
+        whole = {case: finished.row(case, "mcguire", "given").figures["flip"] for case in CASES}
+        for case, figure in whole.items():
+            assert flips[case] == pytest.approx(figure.value)
+        assert flips["mean"] == pytest.approx(np.mean([figure.value for figure in whole.values()]))
+        (two,) = [
+            one
+            for one in found.scored
+            if (one.case, one.filter) == ("two", "mcguire") and one.variant == "given"
+        ]
+        parts = {
+            lines: s.metrics(np.ones((1, len(s))))["flip"][0] for lines, s in two.heights.items()
+        }
+        assert set(parts) == {48, 1080}
+        for lines, case in ((48, "one"), (1080, "three")):
+            want = (whole[case].value + parts[lines]) / 2
+            assert flips[f"mean, {lines} lines"] == pytest.approx(want)
+
+    def test_tables_have_them(self, finished, several):
+        config, found, _ = several
+        files = write_crossfit(finished.root / "heights", config, found)
+        text = files[0].read_text()
+        heads = [line for line in text.splitlines() if line.startswith("## ")]
+        assert heads[:4] == [
+            "## Mean over the cases, 1080 lines", "## Mean over the cases, 48 lines",
+            "## Mean over the cases", "## one",
+        ]  # fmt: skip
+        assert "| one | two | three | mean, 1080 lines | mean, 48 lines | mean |" in text
+        command = ["crossfit", str(finished.root / "heights.yaml")]
+        output = CliRunner().invoke(app, [*command, "-o", str(finished.root / "heights")]).output
+        assert "Mean over the cases that were left out, 1080 lines" in output
+
+
+@pytest.mark.filterwarnings("error")
+def test_what_is_cut_is_told(finished):
+    """Half spreads are 2, 3 and 4 px; two frames are of the second case."""
+    assert not (finished.folder / "tables.md").read_text().count("Cut short")
+
+    def change(data):
+        data["filters"].pop("guertin")
+        data["filters"]["mcguire"]["filter"]["params"]["tile_size"] = 2
+
+    config = loaded(finished.root, change, "cut.yaml")
+    files = write_crossfit(
+        finished.root / "cut", config, run_crossfit(config, finished.root / "cut")
+    )
+    text = files[0].read_text()
+    assert "- mcguire given: on 3 of 4 frames it cuts short up to 4.7 % of the pixels" in text
+    assert "goes up to 4 px to each side." in text
 
 
 class TestTargets:

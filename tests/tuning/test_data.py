@@ -11,6 +11,8 @@ from planted import planted_case, tiny_frame
 
 import tuning.data
 from torchblur.errors import ConfigError, FileFormatError
+from torchblur.filters import get_filter
+from torchblur.frame import Shutter
 from torchblur.io import write_frame, write_image
 from torchblur.params import build
 from tuning.data import cache_folder, load_cases
@@ -169,6 +171,19 @@ class TestExr:
         picked = load_cases(spec_of(tmp_path, train=[item | {"frames": [10]}]))
         assert [c.name for c in picked] == ["walk 0010"]
 
+    def test_lines_of_a_larger_camera(self, tmp_path):
+        exr_case(tmp_path / "a", 1)
+        item = {"kind": "exr", "path": "a"}
+        spec = spec_of(tmp_path, train=[item])
+        assert load_cases(spec)[0].lines == 48
+        assert "lines" not in spec.model_dump()["train"][0]
+        spec = spec_of(tmp_path, train=[item | {"lines": 1080}])
+        assert load_cases(spec)[0].lines == 1080
+        assert build(DataSpec, spec.model_dump()) == spec
+        small = spec_of(tmp_path, train=[item | {"lines": 47}])
+        with pytest.raises(ConfigError, match=r"at least the frame's, 48 px, got 47 \(data\.train"):
+            load_cases(small)
+
     def test_layers_of_a_gbuffer(self, tmp_path):
         exr_case(tmp_path / "one", seed=1)
         other = tiny_frame(2)
@@ -252,6 +267,40 @@ class TestWindows:
             assert top >= 2 * tile_size or outer_top == 0
             assert rows - top - height >= 2 * tile_size or at_end
             assert columns - left - width >= 2 * tile_size or outer_left + columns == 128
+
+    @pytest.mark.parametrize(
+        ("shutter", "params", "context"),
+        [
+            (Shutter(1.0), {"reach": "tile"}, 16),
+            (Shutter(1.0), {"reach": "frame"}, 25 + 8),
+            (Shutter(0.5), {"reach": "frame"}, 13 + 8),
+            (Shutter(0.5, "trailing"), {"reach": "frame"}, 25 + 8),
+            (Shutter(1.0), {"reach": "frame", "max_reach": 10.0}, 10 + 8),
+        ],
+    )
+    def test_context_follows_the_reach(self, shutter, params, context):
+        size = (400, 400)
+        frame = tiny_frame(1, size)
+        velocity = torch.zeros_like(frame.velocity)
+        velocity[:, 0, 200:216, 200:216] = 50.0
+        case = dataclasses.replace(
+            planted_case(1),
+            frame=dataclasses.replace(frame, velocity=velocity),
+            reference=frame.color,
+            band=torch.zeros(1, 1, *size, dtype=torch.bool),
+            shutter=shutter,
+        )
+        blur = get_filter("guertin2014")(tile_size=8, **params)
+        crops = Crops(size=16, per_frame=4)
+        for sample in make_samples([case], crops, tile_size=8, seed=0, blur=blur):
+            top, left, height, width = sample.inner
+            ends = [
+                size - at - edge
+                for size, at, edge in zip(sample.size, (top, left), (height, width), strict=True)
+            ]
+            assert min(top, left) >= context
+            assert min(ends) >= context
+            assert max(top, left) < context + 8
 
     def test_windows_lie_where_something_moves(self):
         frame = tiny_frame(1)

@@ -69,6 +69,14 @@ class TestData:
         assert case.reference.shape[-2:] == (16, 24)
         assert_is_part(case.frame, whole, left, top)
 
+    @pytest.mark.parametrize("kind", ["scene", "scene_stream"])
+    def test_lines_are_those_of_the_whole(self, tmp_path, scene, kind):
+        (window,) = load(tmp_path, scene | {"kind": kind})
+        whole = {key: value for key, value in scene.items() if key != "of"}
+        (own,) = load(tmp_path, whole | {"kind": kind})
+        assert (window.lines, own.lines) == (64, 16)
+        assert window.to("cpu").lines == 64
+
     def test_a_sequence_is_the_same_part_in_all_frames(self, tmp_path, scene):
         item = scene | {"kind": "scene_stream", "frames": [0, 1, 2], "at": "motion"}
         (case,) = load(tmp_path, item)

@@ -10,14 +10,17 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
-from planted import write_planted
+from planted import planted_case, write_planted
 
 from torchblur.metrics import flip_ldr
 from torchblur.params import build
-from tuning.config import TuneConfig
+from tuning.config import ObjectiveSpec, TuneConfig
+from tuning.evidence import evidence_of
 from tuning.fit import run_fit
 from tuning.page import Column, Row, Table, error_map, image_uri, make_view, map_limit, render_page
-from tuning.report import figures_table, verdict_of
+from tuning.printing import print_fit
+from tuning.report import figures_table, figures_tables, verdict_of
+from tuning.result import CaseScore
 
 
 @pytest.fixture(scope="module")
@@ -142,6 +145,80 @@ class TestFigures:
         assert not verdict_of(result.model_copy(update={"scores": tuple(swapped)})).good
         unchanged = result.model_copy(update={"chosen": "start"})
         assert "better than the start values" in verdict_of(unchanged).text
+
+
+class TestHeights:
+    """Figures of the hold-out at each height; those of "tall" are 0.3, of "small" 0.1 and 0.2."""
+
+    @pytest.fixture
+    def result(self, run):
+        given = {"tall": (0.3, 0.2, 1080), "small": (0.1, 0.2, 136), "other": (0.2, 0.1, 136)}
+        scores = [
+            CaseScore(
+                case=case,
+                split=split,
+                variant=variant,
+                scores={"flip": flip, "psnr": 30.0},
+                lines=lines,
+            )
+            for split in ("train", "holdout")
+            for case, (tuned, line, lines) in given.items()
+            for variant, flip in (("tuned", tuned), ("line", line), ("default", 0.5))
+        ]
+        return run[0].model_copy(update={"scores": tuple(scores)})
+
+    def test_means(self, result):
+        assert result.heights("holdout") == (1080, 136)
+        assert result.height_groups() == (1080, 136, None)
+        means = [result.mean("tuned", "holdout", "flip", lines) for lines in (1080, 136, None)]
+        assert means == pytest.approx([0.3, 0.15, 0.2])
+
+    def test_tables(self, result):
+        tables = figures_tables(result)
+        assert [table.title for table in tables] == [
+            "Hold-out, 1080 lines: 1 frame",
+            "Hold-out, 136 lines: 2 frames",
+            "Hold-out, all heights: 3 frames",
+            "Training: 3 frames",
+        ]
+        rows = [{row.name: row.values[0] for row in table.rows} for table in tables]
+        assert [row["tuned"] for row in rows] == pytest.approx([0.3, 0.15, 0.2, 0.2])
+
+    def test_verdict_names_where_the_line_blur_is_better(self, result):
+        text = verdict_of(result).text
+        assert text.endswith("Worse than a line blur at 1080 lines (0.3000 against 0.2000).")
+
+    def test_printed(self, result, tmp_path, capsys):
+        print_fit(result, tmp_path)
+        titles = [
+            line.rstrip()
+            for line in capsys.readouterr().out.splitlines()
+            if line.startswith(("hold", "train"))
+        ]
+        assert titles == [
+            "training frames", "hold-out, 1080 lines", "hold-out, 136 lines",
+            "hold-out, all heights",
+        ]  # fmt: skip
+
+    def test_evidence(self, result):
+        cases = [planted_case(1), planted_case(2, "holdout")]
+        evidence = evidence_of(result, ObjectiveSpec(), cases, ("default", "tuned"))
+        figures = {key: one["tuned"]["flip"] for key, one in evidence["figures"].items()}
+        assert figures == pytest.approx(
+            {"train": 0.2, "holdout, 1080 lines": 0.3, "holdout, 136 lines": 0.15, "holdout": 0.2}
+        )
+
+    def test_one_height_or_none_known_is_one_table(self, run, result):
+        low = tuple(score for score in result.scores if score.lines == 136)
+        unknown = tuple(s.model_copy(update={"lines": None}) for s in result.scores)
+        for scores in (low, unknown):
+            one = result.model_copy(update={"scores": scores})
+            assert one.height_groups() == (None,)
+            titles = [table.title.partition(":")[0] for table in figures_tables(one)]
+            assert titles == ["Hold-out", "Training"]
+
+    def test_a_fit_writes_them(self, run):
+        assert {score.lines for score in run[0].scores} == {48}
 
 
 class TestPage:

@@ -87,6 +87,10 @@ class ReachingBlur(BlurFilter):
         frame, values = super()._prepared(frame, overrides)
         return _cut(frame, values)
 
+    def keep_quiet(self) -> None:
+        """Warn of no cuts: for callers that call often, and tell what `cut` returns."""
+        self._cut_told = True
+
     def _prepared(self, frame: Frame, overrides: dict[str, Any]) -> tuple[Frame, Values]:
         frame, values = super()._prepared(frame, overrides)
         if not self._cut_told and not takes_all_pixels():

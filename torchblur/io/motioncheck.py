@@ -28,13 +28,15 @@ _SMOOTH_ALONG, _SMOOTHER_THAN_ACROSS = 0.21, 0.87
 class VelocityInfo:
     """Speeds in px/frame: median, 95th percentile and maximum of the pixels that move.
 
-    Moving is 0.5 px/frame and more; `moving_share` is their share of all pixels.
+    Moving is 0.5 px/frame and more; `moving_share` is their share of all pixels. `percentiles` are
+    of all pixels, 0 to 100.
     """
 
     median: float
     percentile_95: float
     maximum: float
     moving_share: float
+    percentiles: tuple[float, ...]
 
 
 @dataclass(frozen=True)
@@ -72,10 +74,12 @@ def check_speed(velocity: Tensor) -> VelocityInfo:
     """Return the speeds of a velocity in px/frame, (1, 2, H, W)."""
     speed = velocity.norm(dim=1).numpy()
     moving = speed[speed >= _MOVING]
+    percentiles = tuple(np.percentile(speed, range(101)).tolist())
     if not moving.size:
-        return VelocityInfo(0.0, 0.0, float(speed.max()), 0.0)
+        return VelocityInfo(0.0, 0.0, float(speed.max()), 0.0, percentiles)
     median, high = (float(q) for q in np.percentile(moving, [50, 95]))
-    return VelocityInfo(median, high, float(moving.max()), moving.size / speed.size)
+    share = moving.size / speed.size
+    return VelocityInfo(median, high, float(moving.max()), share, percentiles)
 
 
 def check_blur(color: Tensor, velocity: Tensor) -> BlurCheck:
