@@ -107,7 +107,7 @@ def _head(card: Card, used: str) -> str:
     return (
         (f"**{worse}**\n\n" if worse else "")
         + f"{summary}: `{card.preset.filter}` with constants that were fitted to references"
-        f"{_heights(card.result)}.{f' {cut}' if cut else ''}\n\n"
+        f"{_heights(card.result)}.{f' Mind its reach: {cut}' if cut else ''}\n\n"
         f"```\n{card.result.command}\ntorchblur filter {used} INPUT.exr -o OUTPUT.exr\n```\n\n"
         f"The first command makes it (search and gradient: {_time(card.result)}), the second uses "
         "it."

@@ -1,7 +1,8 @@
 """What a filter costs per pixel, counted from its configuration: lookups, arithmetic, passes.
 
 The unit is one nearest lookup of a color. The count is that of a frame in which everything moves,
-along paths that `num_samples` taps suffice for (longer ones have more with `tap_spacing`), and knows nothing of caches: it ranks settings of a filter well, and compares filters roughly.
+along paths that `num_samples` taps suffice for (longer ones have more with `tap_spacing`). It knows
+nothing of caches: it ranks settings of a filter well, and compares filters roughly.
 `Cost.relative` is the total over that of Guertin 2014 with 35 nearest taps, as published.
 
 A filter outside this table has a class method ``cost(config) -> Cost`` instead.

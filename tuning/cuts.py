@@ -26,7 +26,12 @@ class Cuts(NamedTuple):
         Args:
             frames: What they are called: "hold-out frames".
         """
-        share = "less than 0.1 %" if self.share < 0.001 else f"up to {100 * self.share:.1f} %"
+        percent = 100 * self.share
+        share = (
+            "less than 0.1 %"
+            if percent < 0.1
+            else f"up to {percent:.{0 if percent >= 10 else 1}f} %"
+        )
         return (
             f"on {self.frames} of {self.of} {frames} it cuts short {share} of the pixels, whose "
             f"blur goes up to {self.longest:.0f} px to each side"

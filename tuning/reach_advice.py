@@ -38,11 +38,11 @@ def reach_advice(speeds: Sequence[float]) -> str:
             f"reach=frame and a max_reach of {math.ceil(longest)}"
         )
     name = max(cuts, key=lambda name: cuts[name].reach)
-    share = cuts[name].share
+    cut = cuts[name]
+    share = f"{100 * cut.share:.0f} %" if cut.share > _LEAST else "less than 1 %"
     return (
         f"{lengths}; the default follows it; filters of papers need reach=frame or a tile_size "
-        f"of {math.ceil(longest)} ({name} has {cuts[name].reach:g}: "
-        f"{f'{100 * share:.0f} %' if share > _LEAST else 'less than 1 %'} of the pixels would be cut)"
+        f"of {math.ceil(longest)} ({name} has {cut.reach:g}: {share} of the pixels would be cut)"
     )
 
 

@@ -240,20 +240,19 @@ class FitResult(Config):
 
 
 def cut_text(result: FitResult, variant: str) -> str:
-    """Return what a variant cuts short of the hold-out, or of what was fitted, in a sentence.
+    """Return what a variant cuts short of the hold-out, or of what was fitted, in words.
 
     Args:
         result: A fit's result.
         variant: As in `CaseScore.variant`.
 
     Returns:
-        The sentence, or nothing if nothing is cut of either.
+        "on 1 of 5 hold-out frames it cuts short …", or nothing if nothing is cut of either.
     """
     for split, frames in (("holdout", "hold-out frames"), ("train", "training frames")):
         cuts = result.cuts(variant, split)
         if cuts is not None:
-            text = cuts.text(frames)
-            return f"{text[0].upper()}{text[1:]}."
+            return f"{cuts.text(frames)}."
     return ""
 
 

@@ -50,6 +50,12 @@ def test_the_demo_has_what_it_promises(repository):
     assert {method.kind for method in config.methods} == {"gradient", "blackbox"}
 
 
+def test_the_demo_is_checked_at_1080_lines(repository):
+    data = load_tune_config(repository / "configs" / "tune" / "demo.yaml").data
+    assert [item.lines for item in data.train] == [None] * 4
+    assert [item.lines for item in data.holdout] == [None] * 4 + [1080]
+
+
 def test_resolved_configuration_is_read_back_equal(tmp_path):
     config = load(tmp_path, changed(data={"root": "frames"}))
     assert config.data.root == str(tmp_path / "frames")

@@ -88,7 +88,7 @@ class TestWords:
         found = cuts_over([(0.1, 50.0), (0.0, 90.0), (0.25, 40.0)])
         assert found == Cuts(2, 3, 0.25, 50.0)
         assert found.text("frames") == (
-            "on 2 of 3 frames it cuts short up to 25.0 % of the pixels, whose blur goes up to "
+            "on 2 of 3 frames it cuts short up to 25 % of the pixels, whose blur goes up to "
             "50 px to each side"
         )
         assert "short less than 0.1 % of" in Cuts(1, 3, 0.0004, 50.0).text("frames")
@@ -123,7 +123,7 @@ class TestOfAFit:
 
     def test_report(self, run):
         page = (run[0] / "report.html").read_text()
-        assert "Tuned: On 1 of 1 hold-out frames it cuts short up to " in page
+        assert "Tuned: on 1 of 1 hold-out frames it cuts short up to " in page
         assert "cut, % after" in page
 
     def test_printed(self, run, capsys):
@@ -139,7 +139,7 @@ class TestOfAFit:
             variant="tuned",
         )
         head = card_text(card, "p", "i", "").split("```")[0]
-        assert f"48 lines. {cut_text(run[1], 'tuned')}\n" in head
+        assert f"48 lines. Mind its reach: {cut_text(run[1], 'tuned')}\n" in head
 
     def test_an_old_result_says_nothing(self, run, tmp_path):
         data = json.loads((run[0] / "result.json").read_text())
