@@ -10,10 +10,17 @@ from types import SimpleNamespace
 import numpy as np
 from twins import reconstruction as common
 from twins.notes2025 import tile_of, tiles_of
+from twins.reach import directions_of, taps_of
 from twins.reconstruction import length, sat, scaled
 
 DEFAULTS = common.DEFAULTS | {
     "num_samples": 16,
+    "reach": "frame",
+    "max_reach": 512.0,
+    "tile_size": 8,
+    "early_out": 0.25,
+    "tap_spacing": 3.0,
+    "max_samples": 128,
     "first_direction": True,
     "own_direction": True,
     "second_direction": True,
@@ -60,7 +67,10 @@ def composed(color, depth, velocity, *, tap_noise=None, tile_noise=None, **chang
     settings.tile_noise = half if tile_noise is None else tile_noise
     depth, velocity = clean_edges(depth, velocity, settings)
     field = common.half_velocity(velocity, settings)
-    first, second, _ = tiles_of(field, settings)
+    if settings.reach == "frame":
+        first, second = directions_of(field, settings)
+    else:
+        first, second, _ = tiles_of(field, settings)
     image, alphas = np.zeros_like(color), np.zeros((1, *depth.shape))
     for y in range(depth.shape[0]):
         for x in range(depth.shape[1]):
@@ -106,7 +116,9 @@ def clean_edges(depth, velocity, settings):
 def at_pixel(pixel, starts, settings):
     """Return the color of a pixel, and the share of the time at which something arrives."""
     names = [n for n in starts if getattr(settings, f"{n}_direction")] or ["own"]
-    front, back, count = np.zeros(4), np.zeros(4), settings.num_samples
+    front, back = np.zeros(4), np.zeros(4)
+    moving = [pixel.field[pixel.y][pixel.x], *(starts[name] for name in names)]
+    count = taps_of([length(v) for v in moving], settings)
     seen, hidden = np.zeros(4), 0.0
     shift = settings.jitter * (settings.tap_noise[pixel.y, pixel.x] - 0.5)
     share = 0.0

@@ -80,6 +80,8 @@ def floored_length(v, settings):
 def half_velocity(velocity, settings):
     """V = ½ · shutter · velocity, no longer than a tile (half a tile if not centered)."""
     limit = settings.tile_size / (1 + abs(settings.c))
+    if getattr(settings, "reach", "tile") == "frame":
+        limit = settings.max_reach
     _, rows, columns = velocity.shape
     field = []
     for y in range(rows):
