@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Annotated, Literal
 
+from torchblur.filters.reach import TILE_MEANING
 from torchblur.filters.reconstruction import ReconstructionConfig
 from torchblur.filters.revealed import RevealedBackgroundConfig
 from torchblur.params import Param
@@ -26,7 +27,7 @@ class Guertin2014Config(RevealedBackgroundConfig, ReconstructionConfig):
         int,
         Param(symbol="r", unit="px", low=1, high=512, scale="log", grad="discrete",
               source=_SETTINGS,
-              meaning="edge of a tile, and the longest half spread that is blurred"),
+              meaning=TILE_MEANING),
     ] = 40
     tau: Annotated[
         float,

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Annotated, Literal
 
 from torchblur.filters.places import PairNoise
-from torchblur.filters.reach import ReachConfig
+from torchblur.filters.reach import TILE_MEANING, ReachConfig
 from torchblur.filters.revealed import RevealedBackgroundConfig
 from torchblur.ops.gather import Lookup
 from torchblur.ops.spread import Mirror, SpreadForm
@@ -30,7 +30,7 @@ class Jimenez2014Config(RevealedBackgroundConfig, ReachConfig):
         int,
         Param(symbol="r", unit="px", low=1, high=512, scale="log", grad="discrete",
               source="McGuire 2012, section 3",
-              meaning="edge of a tile, and the longest half spread that is blurred"),
+              meaning=TILE_MEANING),
     ] = 20
     depth_scale: Annotated[
         float,

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Annotated, Literal
 
 from torchblur.filters.places import PairNoise
-from torchblur.filters.reach import ReachConfig
+from torchblur.filters.reach import TILE_MEANING, ReachConfig
 from torchblur.filters.revealed import RevealedBackgroundConfig
 from torchblur.ops.directions import DirectionReduction
 from torchblur.ops.spread import Mirror, SpreadForm
@@ -39,7 +39,7 @@ class Notes2025Config(RevealedBackgroundConfig, ReachConfig):
     )] = 6
     tile_size: Annotated[int, Param(
         symbol="r", unit="px", low=1, high=512, scale="log", grad="discrete", source=_BASE,
-        meaning="edge of a tile, and the longest half spread that is blurred (full resolution)",
+        meaning=f"{TILE_MEANING} (full resolution)",
     )] = 32
     noise: Annotated[PairNoise, Param(
         grad="discrete", source=_BASE,

@@ -18,6 +18,7 @@ from torchblur.ops.pixels import PixelList, select, takes_all_pixels
 from torchblur.params import Param
 
 __all__ = [
+    "TILE_MEANING",
     "Cut",
     "Gather",
     "ReachConfig",
@@ -28,6 +29,9 @@ __all__ = [
     "swept_times",
     "tap_counts",
 ]
+
+TILE_MEANING = "edge of a tile, and the longest half spread that is blurred (reach: tile)"
+"""What `tile_size` means in filters that are named after papers."""
 
 _WORTH_NAMING = 0.01  # share of the pixels
 _LONGER = 1.1  # how much longer than the reach a half spread must be to count as cut

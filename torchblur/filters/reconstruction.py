@@ -8,7 +8,7 @@ from typing import Annotated, Literal, NamedTuple
 import torch
 from torch import Tensor
 
-from torchblur.filters.reach import ReachConfig
+from torchblur.filters.reach import TILE_MEANING, ReachConfig
 from torchblur.filters.revealed import background_share
 from torchblur.filters.spreads import Spread
 from torchblur.frame import Frame
@@ -65,7 +65,7 @@ class ReconstructionConfig(ReachConfig):
             scale="log",
             grad="discrete",
             source="McGuire 2012, section 3",
-            meaning="edge of a tile, and the longest half spread that is blurred",
+            meaning=TILE_MEANING,
         ),
     ] = 20
     cone_slope: Annotated[

@@ -26,8 +26,8 @@ class Tan2022Config(ReconstructionConfig):
     )] = "leading"
     tile_size: Annotated[int, Param(
         symbol="m", unit="px", low=1, high=512, scale="log", grad="discrete", source=_SETTINGS,
-        meaning="edge of a tile, and the longest blur: the whole of it on one side, half of it "
-                "with a centered shutter",
+        meaning="edge of a tile, and the longest blur (reach: tile): the whole of it on one side, "
+                "half of it with a centered shutter",
     )] = 40
     soft_depth_extent: Annotated[float, Param(
         symbol="SOFT_Z_EXTENT", unit="scene units", low=1e-4, high=1e4, scale="log",
