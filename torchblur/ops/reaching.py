@@ -163,21 +163,18 @@ def _pairs(vectors: Tensor, tile_size: int, longest: float, interval: Interval) 
     ring = torch.arange(-1, 2, device=vectors.device)
     yield grid.reached(every, ring.repeat(3)[None], ring.repeat_interleave(3)[None])
     x, y = _flat(vectors) / tile_size
-    if takes_all_pixels():
-        yield grid.swept(every, x, y, math.ceil(longest / tile_size), interval)
-        return
     far = torch.maximum(x.abs(), y.abs())
-    order = far.argsort()
-    order = order[int((far <= 0).sum()) :]
-    start, number = 0, order.shape[0]
-    while start < number:  # the longest last: each part is as wide as its longest vector
-        stop = min(number, start + _PAIRS // 32)
-        steps = float(far[order[stop - 1]])
-        fitting = max(1, int(_PAIRS // (_ACROSS * (2 * steps + 3))))
-        stop = min(stop, start + fitting)
-        steps = float(far[order[stop - 1]])
-        yield grid.swept(order[start:stop], x, y, steps, interval)
-        start = stop
+    order, start = every, 0
+    if not takes_all_pixels():
+        order = far.argsort()[int((far <= 0).sum()) :]
+    while start < order.shape[0]:  # the longest last: each part is as wide as its longest vector
+        part = order[start : start + _PAIRS // 32]
+        steps = longest / tile_size if takes_all_pixels() else float(far[part[-1]])
+        part = part[: max(1, int(_PAIRS / (_ACROSS * (2 * steps + 3))))]
+        if not takes_all_pixels():
+            steps = float(far[part[-1]])
+        yield grid.swept(part, x, y, steps, interval)
+        start += part.shape[0]
 
 
 class _Grid:
