@@ -32,8 +32,18 @@ DEFAULTS = {
 }
 
 
+def within_tiles(changes):
+    """The parameters without those of the reach: the papers' is a tile, with N taps for all."""
+    if changes.get("reach", "tile") != "tile" or changes.get("tap_spacing", 0.0):
+        raise ValueError("this twin blurs as far as its tiles, with as many taps everywhere")
+    ours = ("reach", "max_reach", "tap_spacing", "max_samples")
+    return {name: value for name, value in changes.items() if name not in ours}
+
+
 def settings_of(defaults, changes):
     """The parameters by name; an unknown name or a softness is refused."""
+    if "reach" not in defaults:
+        changes = within_tiles(changes)
     unknown = set(changes) - set(defaults)
     if unknown:
         raise TypeError(f"the twin knows no {sorted(unknown)}")
