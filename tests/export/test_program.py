@@ -6,7 +6,7 @@ import pytest
 import torch
 from tiny_shots import moving_square
 
-from torchblur.errors import ConfigError, FrameError, OutputError
+from torchblur.errors import ConfigError, FrameError, OutputError, ReachWarning
 from torchblur.export import EXPORTABLE, export_program, save_program
 from torchblur.filters import get_filter, registered_filters
 from torchblur.frame import Frame
@@ -70,7 +70,7 @@ class TestEqual:
 
     def test_to_the_tuned_preset(self, tmp_path, frame, repository):
         path = repository / "configs" / "filters" / "guertin2014-tuned.yaml"
-        blur = create_filter(path, num_samples=4, noise="halton", tile_size=8)
+        blur = create_filter(path, num_samples=4, noise="halton", tile_size=8, tap_spacing=0.0)
         program = through_a_file(export_program(blur, frame), tmp_path)
         for shown in (frame, other_frame()):
             want = blurred(blur, shown)
@@ -79,11 +79,22 @@ class TestEqual:
     @pytest.mark.slow
     @pytest.mark.parametrize("name", ["notes2025", "tan2022", "torchblur"])
     def test_of_the_long_graphs(self, tmp_path, frame, name):
-        blur = create_filter(name, num_samples=4, tile_size=8)
+        blur = create_filter(name, num_samples=4, tile_size=8, tap_spacing=0.0)
         program = through_a_file(export_program(blur, frame), tmp_path)
         for shown in (frame, other_frame()):
             want = blurred(blur, shown)
             torch.testing.assert_close(program(*planes(shown)), want, **CLOSE)
+
+    def test_a_reach_that_follows_the_frame_and_taps_that_cannot(self, tmp_path, frame):
+        blur = create_filter(
+            "mcguire2012", num_samples=3, tile_size=4, reach="frame", max_reach=60.0
+        )
+        program = through_a_file(export_program(blur, frame), tmp_path)
+        fast = other_frame().map(lambda t: 12 * t if t.shape[1] == 2 else t)
+        torch.testing.assert_close(program(*planes(fast)), blurred(blur, fast), **CLOSE)
+        blur = create_filter("mcguire2012", num_samples=3, tap_spacing=2.0)
+        with pytest.warns(ReachWarning, match="has 3 taps on every path"):
+            export_program(blur, frame)
 
     def test_of_a_batch_where_nothing_moves_in_the_example(self, tmp_path):
         shown = Frame.stack([other_frame(), other_frame().map(lambda t: t.flip(3))])

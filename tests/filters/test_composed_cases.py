@@ -18,6 +18,7 @@ GAPS = {"num_samples": 4, "shutter": 1.5}
 CASES = {
     "mcguire2012": [
         {},
+        {"reach": "frame", "tile_size": 4, "tap_spacing": 1.0, "shutter": 1.5},
         {"noise": "none", "num_samples": 8, "tile_size": 7},
         {"noise": "gradient", "skip_middle_tap": False, "tile_size": 11, "softness": 0.2},
         {"shutter_position": "leading", "jitter": 1.7, "cone_slope": 0.6, "cone_exponent": 0.3},
@@ -27,6 +28,7 @@ CASES = {
     ],
     "guertin2014": [
         {},
+        {"reach": "frame", "tile_size": 4, "tap_spacing": 1.0, "shutter": 1.5, "num_samples": 6},
         {"num_samples": 12, "tile_size": 9, "seed": 3},
         {"noise": "gradient", "tile_size": 7, "tau": 1.8, "neighbor_culling": False},
         {"directions": "one", "tile_size": 8},
@@ -41,6 +43,7 @@ CASES = {
     ],
     "jimenez2014": [
         {},
+        {"reach": "frame", "tile_size": 3, "tap_spacing": 1.0, "shutter": 1.5, "num_samples": 6},
         {"num_samples": 9, "tile_size": 7, "mirror_filter": "strict"},
         {"noise": "gradient", "tile_size": 6, "tile_jitter": 1.7, "seed": 3},
         {"noise": "halton", "jitter": 1.6, "mirror_filter": "none", "depth_scale": 0.3},
@@ -52,6 +55,13 @@ CASES = {
     ],
     "notes2025": [
         {},
+        {
+            "reach": "frame",
+            "tile_size": 3,
+            "tap_spacing": 1.0,
+            "shutter": 1.5,
+            "post_filter": False,
+        },
         ONE,
         {"post_filter": False, "accurate_alpha": False, "double_samples": False},
         ONE | {"separate_sums": False, "post_filter": False},

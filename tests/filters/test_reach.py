@@ -232,3 +232,56 @@ def test_few_pixels_are_not_worth_a_warning(monkeypatch):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         get_filter("guertin2014")(tile_size=20)(passing())
+
+
+def test_a_cut_is_told_at_the_place_of_the_call_of_any_method():
+    with pytest.warns(ReachWarning) as told:
+        get_filter("guertin2014")(tile_size=20).layers(passing())
+    assert told[0].filename == __file__
+
+
+def test_vectors_too_long_for_their_type_are_cut():
+    frame = passing(speed=600.0)
+    half = frame.map(lambda t: t.half())
+    assert get_filter("mcguire2012")().cut(half).share == pytest.approx(0.1, abs=1e-3)
+
+
+def test_8_bits_reach_as_far_as_they_are_asked_to():
+    frame = passing(speed=40.0)  # half spread 10 px, steps of 60 / 127 px
+    exact, coarse = (
+        get_filter("guertin2014")(
+            reach="frame", max_reach=60.0, tile_size=8, velocity_encoding=kind
+        )(frame).detach()
+        for kind in ("float", "uint8")
+    )
+    assert float((exact - coarse).abs().mean()) < 0.01
+    fast = passing(speed=200.0)  # half spread 50 px, six tiles
+    blurred = get_filter("guertin2014")(
+        reach="frame", max_reach=60.0, tile_size=8, velocity_encoding="uint8", tap_spacing=4.0
+    )(fast).detach()
+    row = (blurred[0, 0, 12] > 0.02).nonzero()[:, 0]
+    assert int(row.max() - row.min()) > 40 + 80
+
+
+def test_plain_taps_know_what_lies_beyond_the_neighboring_tiles():
+    # All pixels of the 3x3 tiles around the middle move alike, those that its taps meet do not.
+    frame = passing(speed=200.0)
+    velocity = torch.zeros_like(frame.velocity)
+    velocity[..., 140:260] = torch.tensor([200.0, 0.0]).view(1, 2, 1, 1)
+    frame = frame.replaced(velocity=velocity)
+    blur = get_filter("jimenez2014")(reach="frame", tile_size=10, noise="none", tile_jitter=0.0)
+    classes = blur.layers(frame)["tile_class"][0, 0, 12]
+    assert [int(classes[x]) for x in (200, 165)] == [1, 2]  # 60 px and 25 px from the edge
+
+
+def test_half_resolution_reaches_as_far():
+    frame = passing(speed=200.0)
+    ends = []
+    for resolution in ("full", "half"):
+        blurred = get_filter("notes2025")(
+            reach="frame", tile_size=16, resolution=resolution, max_reach=40.0, post_filter=False
+        )(frame)
+        row = (blurred.detach()[0, 0, 12] > 0.02).nonzero()[:, 0]
+        ends.append((int(row.min()), int(row.max())))
+    assert abs(ends[0][0] - ends[1][0]) <= 4
+    assert abs(ends[0][1] - ends[1][1]) <= 4

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 from torch.export import ExportedProgram
 
-from torchblur.errors import ConfigError
+from torchblur.errors import ConfigError, ReachWarning
 from torchblur.filters import BlurFilter
 from torchblur.frame import Frame
 from torchblur.io.paths import output_file
@@ -29,7 +29,8 @@ EXPORTABLE = (
     "tan2022",
     "torchblur",
 )
-"""Filters of which a graph can be recorded: what they do does not depend on the frame's values."""
+"""Filters of which a graph can be recorded: what they do does not depend on the frame's values, but
+for the taps of long paths (`tap_spacing`), which a graph does not have."""
 
 
 class _FrameFilter(nn.Module):
@@ -66,6 +67,9 @@ def export_program(blur: BlurFilter, frame: Frame) -> ExportedProgram:
             layers than color, velocity and depth.
         FrameError: the example has no depth.
 
+    A graph has `num_samples` taps on every path; with `tap_spacing` the filter itself takes more on
+    long ones, and a warning says so: give more `num_samples` for such frames.
+
     Differentiable: no; the result is for inference.
     """
     if blur.name not in EXPORTABLE:
@@ -77,6 +81,15 @@ def export_program(blur: BlurFilter, frame: Frame) -> ExportedProgram:
         raise ConfigError(
             "`background` must be 'guessed' in a program, which takes color, velocity and depth "
             "alone, got 'revealed'"
+        )
+    if getattr(blur.config, "tap_spacing", 0.0) > 0:
+        samples = getattr(blur.config, "num_samples", 0)
+        warnings.warn(
+            f"a program of `{blur.name}` has {samples} taps on every path, also on those that are "
+            "so long that `tap_spacing` would give them more; give more `num_samples` for them, or "
+            "`tap_spacing` 0",
+            ReachWarning,
+            stacklevel=2,
         )
     planes = tuple(t.detach() for t in (frame.color, frame.velocity, frame.require("depth")))
     own = copy.deepcopy(blur).requires_grad_(False).eval()

@@ -101,7 +101,7 @@ class ComposedConfig(RevealedBackgroundConfig, ReconstructionConfig):
     )] = "cubic"  # type: ignore[assignment]  # more than the base has
     bilinear_min: Annotated[float, Param(
         unit="px", low=0.0, high=8.0, grad="weak", source=_NOTES,
-        meaning="least half spread in the 3x3 tiles at which the whole tile counts as moving",
+        meaning="least half spread in all tiles within reach at which the whole tile counts as moving",
     )] = 1.0
     double_samples: Annotated[bool, Param(
         grad="discrete", source=_NOTES,
@@ -133,11 +133,11 @@ class ComposedConfig(RevealedBackgroundConfig, ReconstructionConfig):
     )] = 3.0
     neighbor_culling: Annotated[bool, Param(
         grad="discrete", source=f"{_GUERTIN}, section 4.4",
-        meaning="a diagonal tile counts only if its motion can reach the middle one",
+        meaning="reach: tile: a diagonal tile counts only if its motion can reach the middle one",
     )] = False
     direction_reduction: Annotated[DirectionReduction, Param(
         grad="discrete", source=f"hierarchical: {_NOTES}; exact: {_OURS}",
-        meaning="second direction from all pixels, or from cells of 8 px, tiles, and 3x3 tiles",
+        meaning="reach: tile: second direction from all pixels, or from cells, tiles, 3x3 tiles",
     )] = "exact"
     secondary_exponent: Annotated[float, Param(
         low=0.25, high=8.0, scale="log", grad="weak", source=_NOTES,

@@ -107,7 +107,7 @@ class Guertin2014Config(RevealedBackgroundConfig, ReconstructionConfig):
     neighbor_culling: Annotated[
         bool,
         Param(grad="discrete", source="Guertin 2014, section 4.4",
-              meaning="a diagonal tile counts only if its motion can reach the middle one"),
+              meaning="reach: tile: a diagonal tile counts only if it can reach the middle one"),
     ] = True
     center_weight: Annotated[
         bool,

@@ -103,7 +103,7 @@ class Jimenez2014Config(RevealedBackgroundConfig, ReachConfig):
     neighbor_culling: Annotated[
         bool,
         Param(grad="discrete", source="Guertin 2014, section 4.4; CryENGINE 5",
-              meaning="a diagonal tile counts only if its motion can reach the middle one"),
+              meaning="reach: tile: a diagonal tile counts only if it can reach the middle one"),
     ] = False
     tile_encoding: Annotated[
         Literal["float", "uint8"],

@@ -218,7 +218,7 @@ def moving_pixels(frame: Frame, tiles: TileDirections, values: Values) -> PixelL
 def tile_planes(
     color: Tensor, size: Tensor, tiles: TileDirections, pixels: PixelList, values: Values
 ) -> list[Tensor]:
-    """Return both motions of the pixels' tiles, and the shortest half spread of the 3x3 tiles.
+    """Return both motions of the pixels' tiles, and the shortest half spread within reach.
 
     Args:
         color: For its size, (B, 3, H, W).

@@ -119,7 +119,7 @@ class Notes2025Config(RevealedBackgroundConfig, ReachConfig):
     )] = "two"
     direction_reduction: Annotated[DirectionReduction, Param(
         grad="discrete", source=f"hierarchical: {_SECOND}; exact: torchblur",
-        meaning="second direction from all pixels, or from cells of 8 px, tiles, and 3x3 tiles",
+        meaning="reach: tile: second direction from all pixels, or from cells, tiles, 3x3 tiles",
     )] = "exact"
     secondary_exponent: Annotated[float, Param(
         low=0.25, high=8.0, scale="log", grad="weak", source=_SECOND,
@@ -127,7 +127,7 @@ class Notes2025Config(RevealedBackgroundConfig, ReachConfig):
     )] = 2.0
     neighbor_culling: Annotated[bool, Param(
         grad="discrete", source="Guertin 2014, section 4.4",
-        meaning="a diagonal tile counts only if its motion can reach the middle one",
+        meaning="reach: tile: a diagonal tile counts only if it can reach the middle one",
     )] = False
     min_angle: Annotated[float, Param(
         unit="degrees", low=0.0, high=90.0, grad="weak", source=_SECOND,
@@ -220,7 +220,7 @@ class Notes2025Config(RevealedBackgroundConfig, ReachConfig):
     )] = "opportunistic"
     bilinear_min: Annotated[float, Param(
         unit="px", low=0.0, high=8.0, grad="weak", source=_LINEAR,
-        meaning="least half spread in the 3x3 tiles at which the whole tile counts as moving",
+        meaning="least half spread in all tiles within reach at which the whole tile counts as moving",
     )] = 1.0
     double_samples: Annotated[bool, Param(
         grad="discrete", source=_LINEAR,

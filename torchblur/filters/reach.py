@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import math
 import warnings
 from collections.abc import Callable
@@ -33,6 +34,7 @@ __all__ = [
 TILE_MEANING = "edge of a tile, and the longest half spread that is blurred (reach: tile)"
 """What `tile_size` means in filters that are named after papers."""
 
+_OURS = ("torch", "torchblur")
 _WORTH_NAMING = 0.01  # share of the pixels
 _LONGER = 1.1  # how much longer than the reach a half spread must be to count as cut
 
@@ -51,12 +53,14 @@ class ReachConfig(FilterConfig):
     )] = "tile"
     max_reach: Annotated[float, Param(
         unit="px", low=1.0, high=4096.0, scale="log", grad="discrete", source="torchblur",
-        meaning="reach: frame: longest half spread that is blurred; what is longer is cut",
+        meaning="reach: frame: longest half spread that is blurred; what is longer is cut. Vectors "
+                "in 8 bits have steps of max_reach / 127",
     )] = 512.0
     tap_spacing: Annotated[float, Param(
         unit="px", low=0.0, high=64.0, grad="discrete", source="torchblur",
-        meaning="largest distance between neighboring taps of a path: where num_samples would "
-                "leave more there are more taps, up to max_samples; 0: num_samples everywhere",
+        meaning="largest distance between neighboring taps of a path, of all its directions "
+                "together: where num_samples would leave more there are more taps, up to "
+                "max_samples; 0: num_samples everywhere",
     )] = 0.0
     max_samples: Annotated[int, Param(
         unit="taps", low=1, high=1024, scale="log", grad="discrete", source="torchblur",
@@ -77,7 +81,7 @@ class Cut(NamedTuple):
 
 
 class ReachingBlur(BlurFilter):
-    """A filter that blurs only so far; where that cuts motion short it says so, once."""
+    """A filter that blurs only so far; where that cuts motion short each Module says so, once."""
 
     _cut_told = False
 
@@ -101,7 +105,7 @@ class ReachingBlur(BlurFilter):
             cut = _cut(frame, values)
             if cut.share >= _WORTH_NAMING:
                 self._cut_told = True
-                warnings.warn(self._advice(cut), ReachWarning, stacklevel=5)
+                warnings.warn(self._advice(cut), ReachWarning, stacklevel=_level_of_caller())
         return frame, values
 
     def _advice(self, cut: Cut) -> str:
@@ -118,10 +122,19 @@ class ReachingBlur(BlurFilter):
         )
 
 
+def _level_of_caller() -> int:
+    """Return the stack level, for a warning, of the first caller outside of torch and torchblur."""
+    frame, level = inspect.currentframe(), 0
+    while frame is not None and frame.f_globals.get("__name__", "").split(".")[0] in _OURS:
+        frame, level = frame.f_back, level + 1
+    return level
+
+
 @torch.no_grad()
 def _cut(frame: Frame, values: Values) -> Cut:
     reach, half_open = longest_spread(values), values.shutter * 0.5
-    size = frame.velocity.square().sum(1, keepdim=True).sqrt_()
+    # Squares of long vectors overflow, in 16 bits from 256 px on.
+    size = torch.hypot(*frame.velocity.float().split(1, 1))
     if half_open.ndim == 4:
         size = size * half_open
     longest = float(size.amax()) * (1.0 if half_open.ndim == 4 else float(half_open))
@@ -223,7 +236,8 @@ def tap_counts(values: Values, reach: Tensor, least: int) -> Tensor:
     if values.tap_spacing <= 0 or takes_all_pixels():
         return torch.full_like(reach, float(least))
     steps = [least]
-    most = max(least, int(values.max_samples * least / values.num_samples))
+    taps_of_one = max(1, round(values.num_samples / least))  # 2 of a pair
+    most = max(least, values.max_samples // taps_of_one)
     while steps[-1] < most:
         steps.append(min(most, math.ceil(least * 2 ** (len(steps) / 2))))
     # A path of 2 reach with n taps has them 2 reach / n apart.

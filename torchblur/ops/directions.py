@@ -26,7 +26,7 @@ _OFFSETS = [(x, y) for y in (-1, 0, 1) for x in (-1, 0, 1)]
 
 
 class TileDirections(NamedTuple):
-    """Displacements in px per tile, of the tile and its eight neighbors, (B, 2, Ty, Tx)."""
+    """Displacements in px per tile, of the tile and of those that reach it, (B, 2, Ty, Tx)."""
 
     primary: Tensor
     secondary: Tensor

@@ -28,7 +28,8 @@ def all_pixels() -> Iterator[None]:
     """Let filters work on all pixels, also on those that stand still.
 
     No size and no branch then depends on what is in the image, as a graph that is recorded once
-    (`torch.export`, CUDA graphs) needs it. The result is the same but for rounding.
+    (`torch.export`, CUDA graphs) needs it. The result is the same but for rounding, and that long
+    paths have `num_samples` taps, whatever `tap_spacing` asks for.
     """
     before = _takes_all.set(True)
     try:
