@@ -86,9 +86,8 @@ class TestEqual:
             torch.testing.assert_close(program(*planes(shown)), want, **CLOSE)
 
     def test_a_reach_that_follows_the_frame_and_taps_that_cannot(self, tmp_path, frame):
-        blur = create_filter(
-            "mcguire2012", num_samples=3, tile_size=4, reach="frame", max_reach=60.0
-        )
+        far = {"reach": "frame", "max_reach": 60.0, "tile_size": 4}
+        blur = create_filter("mcguire2012", num_samples=3, **far)
         program = through_a_file(export_program(blur, frame), tmp_path)
         fast = other_frame().map(lambda t: 12 * t if t.shape[1] == 2 else t)
         torch.testing.assert_close(program(*planes(fast)), blurred(blur, fast), **CLOSE)

@@ -101,7 +101,7 @@ class ComposedConfig(RevealedBackgroundConfig, ReconstructionConfig):
     )] = "cubic"  # type: ignore[assignment]  # more than the base has
     bilinear_min: Annotated[float, Param(
         unit="px", low=0.0, high=8.0, grad="weak", source=_NOTES,
-        meaning="least half spread in all tiles within reach at which the whole tile counts as moving",
+        meaning="least half spread of all tiles within reach at which a tile counts as moving",
     )] = 1.0
     double_samples: Annotated[bool, Param(
         grad="discrete", source=_NOTES,

@@ -220,7 +220,7 @@ class Notes2025Config(RevealedBackgroundConfig, ReachConfig):
     )] = "opportunistic"
     bilinear_min: Annotated[float, Param(
         unit="px", low=0.0, high=8.0, grad="weak", source=_LINEAR,
-        meaning="least half spread in all tiles within reach at which the whole tile counts as moving",
+        meaning="least half spread of all tiles within reach at which a tile counts as moving",
     )] = 1.0
     double_samples: Annotated[bool, Param(
         grad="discrete", source=_LINEAR,
