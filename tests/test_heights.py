@@ -11,10 +11,7 @@ from torchblur.metrics import evaluate
 from torchblur.presets import create_filter
 from torchblur.render import load_scene, render_frame, render_reference
 
-pytestmark = [
-    pytest.mark.slow,
-    pytest.mark.filterwarnings("ignore:tan2022. no layer:UserWarning"),
-]
+pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("ignore:tan2022. no layer:UserWarning")]
 
 CONFIGS = Path(__file__).parents[1] / "configs"
 SHUTTER = 0.3  # half spreads of 17 px at 270 lines, 69 px at 1080
