@@ -7,9 +7,10 @@ from torchblur.errors import ReachWarning
 from torchblur.filters import get_filter
 from torchblur.filters import reach as reach_module
 from torchblur.filters.base import Values
-from torchblur.filters.reach import tap_counts
+from torchblur.filters.reach import by_length, tap_counts
 from torchblur.frame import Frame
 from torchblur.ops import gather as gather_module
+from torchblur.ops.pixels import PixelList
 from torchblur.testing.frames import constant_motion, random_frame
 from torchblur.testing.probes import box_blur
 
@@ -140,6 +141,31 @@ def test_neighboring_taps_are_as_close_as_promised():
     assert float((counts / needed).max()) < 1.5
 
 
+def test_sums_count_alike_whatever_their_taps():
+    # Each tap adds 1 (and a mean is a mean), in three classes of pixels at once.
+    frame = passing(height=4, width=30)
+    pixels = PixelList.all(frame.color)
+    reach = torch.linspace(1, 90, 120).view(1, 1, 1, -1)
+    numbers = []
+
+    def gather(count, lists, some):
+        assert lists["reach"].shape[3] == some.count
+        numbers.append(count)
+        return (torch.full_like(lists["reach"], float(count)), lists["reach"])
+
+    def means(count, lists, some):
+        return (torch.ones_like(lists["reach"]), lists["reach"])
+
+    lists = {"reach": reach, "gain": torch.tensor(2.0)}
+    total, order = by_length(gather, values(), reach, lists, pixels, 16)
+    assert len(set(numbers)) > 3
+    assert torch.equal(total, torch.full_like(reach, 16.0))
+    assert torch.allclose(order * tap_counts(values(), reach, 16) / 16, reach)
+    mean, place = by_length(means, values(), reach, lists, pixels, 16, means=True)
+    assert torch.equal(mean, torch.ones_like(reach))
+    assert torch.equal(place, reach)  # back where they came from
+
+
 def test_pairs_have_half_as_many():
     reach = torch.linspace(0, 300, 97).view(1, 1, 1, -1)
     counts = tap_counts(values(), reach, 8)
@@ -168,6 +194,24 @@ def test_only_long_paths_take_more_taps(monkeypatch, name):
         taken.clear()
         make(name, tap_spacing=2.0, **settings)(fast)
         assert max(number for number, _ in taken) >= 30
+
+
+def test_half_resolution_takes_as_many_taps(monkeypatch):
+    taken = {}
+    original = gather_module.sum_taps
+
+    def counting(tap, options, num_samples, inputs, *args, lists, **kwargs):
+        taken[resolution] = max(taken.get(resolution, 0), num_samples)
+        return original(tap, options, num_samples, inputs, *args, lists=lists, **kwargs)
+
+    monkeypatch.setattr(gather_module, "sum_taps", counting)
+    for resolution in ("full", "half"):
+        blur = get_filter("notes2025")(
+            reach="frame", tap_spacing=4.0, resolution=resolution, post_filter=False
+        )
+        with torch.no_grad():
+            blur(passing(240.0))
+    assert taken["half"] == taken["full"]
 
 
 def test_a_streak_of_a_bright_point_has_no_beads():

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Annotated, Literal
 
 from torchblur.filters.places import PairNoise
+from torchblur.filters.reach import REACH_MEANING, SPACING_MEANING
 from torchblur.filters.reconstruction import ColorLookup, ReconstructionConfig
 from torchblur.filters.revealed import RevealedBackgroundConfig
 from torchblur.ops.directions import DirectionReduction
@@ -115,8 +116,7 @@ class ComposedConfig(RevealedBackgroundConfig, ReconstructionConfig):
     # -- reach and tiles -----------------------------------------------------------------------
     reach: Annotated[Literal["tile", "frame"], Param(
         grad="discrete", source=f"tile: McGuire 2012, section 3; frame: {_OURS}",
-        meaning="the longest half spread that is blurred: a tile, or as long as the frame's "
-                "motion up to max_reach, from whatever tile it comes",
+        meaning=REACH_MEANING,
     )] = "frame"
     tile_size: Annotated[int, Param(
         symbol="r", unit="px", low=1, high=512, scale="log", grad="discrete", source=_OURS,
@@ -128,8 +128,7 @@ class ComposedConfig(RevealedBackgroundConfig, ReconstructionConfig):
     )] = 0.25
     tap_spacing: Annotated[float, Param(
         unit="px", low=0.0, high=64.0, grad="discrete", source=_OURS,
-        meaning="largest distance between neighboring taps of a path: where num_samples would "
-                "leave more there are more taps, up to max_samples; 0: num_samples everywhere",
+        meaning=SPACING_MEANING,
     )] = 3.0
     neighbor_culling: Annotated[bool, Param(
         grad="discrete", source=f"{_GUERTIN}, section 4.4",

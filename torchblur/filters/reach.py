@@ -15,10 +15,12 @@ from torchblur.errors import ReachWarning
 from torchblur.filters.base import BlurFilter, FilterConfig, Values
 from torchblur.frame import Frame, Shutter
 from torchblur.ops.gather import Inputs
-from torchblur.ops.pixels import PixelList, select, takes_all_pixels
+from torchblur.ops.pixels import PixelList, takes_all_pixels
 from torchblur.params import Param
 
 __all__ = [
+    "REACH_MEANING",
+    "SPACING_MEANING",
     "TILE_MEANING",
     "Cut",
     "Gather",
@@ -34,6 +36,18 @@ __all__ = [
 TILE_MEANING = "edge of a tile, and the longest half spread that is blurred (reach: tile)"
 """What `tile_size` means in filters that are named after papers."""
 
+REACH_MEANING = (
+    "the longest half spread that is blurred: a tile, or as long as the frame's motion up to "
+    "max_reach, from whatever tile it comes"
+)
+"""What `reach` means in all filters."""
+
+SPACING_MEANING = (
+    "largest distance between neighboring taps of a path, of all its directions together: where "
+    "num_samples would leave more there are more taps, up to max_samples; 0: num_samples everywhere"
+)
+"""What `tap_spacing` means in all filters."""
+
 _OURS = ("torch", "torchblur")
 _WORTH_NAMING = 0.01  # share of the pixels
 _LONGER = 1.1  # how much longer than the reach a half spread must be to count as cut
@@ -48,8 +62,7 @@ class ReachConfig(FilterConfig):
 
     reach: Annotated[Literal["tile", "frame"], Param(
         grad="discrete", source="tile: McGuire 2012, section 3; frame: torchblur",
-        meaning="the longest half spread that is blurred: a tile, or as long as the frame's "
-                "motion up to max_reach, from whatever tile it comes",
+        meaning=REACH_MEANING,
     )] = "tile"
     max_reach: Annotated[float, Param(
         unit="px", low=1.0, high=4096.0, scale="log", grad="discrete", source="torchblur",
@@ -58,9 +71,7 @@ class ReachConfig(FilterConfig):
     )] = 512.0
     tap_spacing: Annotated[float, Param(
         unit="px", low=0.0, high=64.0, grad="discrete", source="torchblur",
-        meaning="largest distance between neighboring taps of a path, of all its directions "
-                "together: where num_samples would leave more there are more taps, up to "
-                "max_samples; 0: num_samples everywhere",
+        meaning=SPACING_MEANING,
     )] = 0.0
     max_samples: Annotated[int, Param(
         unit="taps", low=1, high=1024, scale="log", grad="discrete", source="torchblur",
@@ -185,7 +196,7 @@ def by_length(
     """Return sums over as many taps as each pixel's path needs, in units of `least` taps.
 
     Pixels are sorted into classes of least · 2^(k/2) taps, so that a longer path costs more and a
-    short one what it always did.
+    short one what it always did. Paths that would need more than `max_samples` have those.
 
     Args:
         gather: Returns the sums, (P, C, 1, m), of a number of taps, lists and their pixels.
@@ -206,12 +217,7 @@ def by_length(
     whole: list[Tensor] = []
     for count, chosen in classes:
         assert chosen is not None
-        some = {
-            name: select(plane, chosen)
-            if not name.startswith("texture") and plane.shape[3:] == (pixels.count,)
-            else plane
-            for name, plane in lists.items()
-        }
+        some = pixels.some_of(lists, chosen)
         sums = _scaled(gather(count, some, pixels.some(chosen)), 1 if means else least / count)
         if not whole:
             whole = [s.new_zeros(*s.shape[:3], pixels.count) for s in sums]

@@ -18,7 +18,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from torchblur.ops.pixels import PixelList, positions, select, takes_all_pixels
+from torchblur.ops.pixels import PixelList, positions, takes_all_pixels
 from torchblur.ops.tap_kernels import Lookups
 from torchblur.ops.taps import Engine, Inputs, Lists, Planes, TapFunction, sum_taps
 
@@ -178,12 +178,7 @@ def gather_some(  # noqa: PLR0913 - what `gather_lists` takes, and which pixels
     """
     chosen = positions(wanted)
     if chosen is not None:
-        lists = {
-            name: select(plane, chosen)
-            if not name.startswith("texture") and plane.shape[3:] == (pixels.count,)
-            else plane
-            for name, plane in lists.items()
-        }
+        lists = pixels.some_of(lists, chosen)
     part = pixels if chosen is None else pixels.some(chosen)
     sums = gather_lists(
         tap, options, num_samples, lists, part, engine, num_maxima=num_maxima, color_from=color_from

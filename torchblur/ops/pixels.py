@@ -254,6 +254,20 @@ class PixelList:
             for name, plane in inputs.items()
         }
 
+    def some_of(self, lists: Mapping[str, Tensor], chosen: Tensor) -> dict[str, Tensor]:
+        """Return lists with some of these pixels; textures and parameters stay as they are.
+
+        Args:
+            lists: Lists of these pixels, textures and parameters by name.
+            chosen: Positions in this list, int64, (m,).
+        """
+        return {
+            name: select(plane, chosen)
+            if not name.startswith("texture") and plane.shape[3:] == (self.count,)
+            else plane
+            for name, plane in lists.items()
+        }
+
     def with_textures(self, lists: Mapping[str, Tensor]) -> dict[str, Tensor]:
         """Return lists with their textures as `texture` has them, and the `rows`."""
         stacked = {
