@@ -20,7 +20,7 @@ DEFAULTS = common.DEFAULTS | {
     "tile_size": 8,
     "early_out": 0.25,
     "tap_spacing": 3.0,
-    "max_samples": 128,
+    "max_samples": 512,
     "first_direction": True,
     "own_direction": True,
     "second_direction": True,

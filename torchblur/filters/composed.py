@@ -20,7 +20,7 @@ from torchblur.filters.composed_gather import (
 from torchblur.filters.composed_motion import clean_edges, half_spreads
 from torchblur.filters.composed_times import fill_hidden, time_tap
 from torchblur.filters.guertin2014 import center_direction
-from torchblur.filters.moving import moving_pixels, packed_values, tile_planes
+from torchblur.filters.moving import least_spread, moving_pixels, packed_values, tile_planes
 from torchblur.filters.notes2025_gather import Blurred, Line, Sums, compose
 from torchblur.filters.notes2025_postfilter import post_filter
 from torchblur.filters.places import SHORTEST_REACH, num_pairs
@@ -121,19 +121,23 @@ def _layers(frame: Frame, values: Values, engine: Engine) -> dict[str, Tensor]:
         planes = dict.fromkeys(("alpha", "output_alpha", "weight"), none)
         return {"color": frame.color} | planes | tiles._asdict()
     here, local = seen.only("depth", "valid").map(pixels.pack), packed_values(values, pixels)
-    first, second, least = tile_planes(seen.color, spread.length, tiles, pixels, values)
+    motions: list[Tensor] = [*tiles]
+    if values.double_samples or values.tile_classes or values.color_lookup == "opportunistic":
+        motions.append(least_spread(spread.length, tiles, values))
+    first, second, *least = tile_planes(seen.color, motions, pixels, values)
     inputs = shared_inputs(here, texture_of(seen, spread), pixels, local)
     first_channel = color_from(seen, spread)
     spread = Spread(*(pixels.pack(plane) for plane in spread))
     inputs |= components("half", spread.half) | {"length": spread.length}
-    inputs["linear"] = (least >= local.bilinear_min).to(frame.dtype)
-    inputs["fast"] = (least >= local.fast_ratio * length(first)).to(frame.dtype)
+    for shortest in least:
+        inputs["linear"] = (shortest >= local.bilinear_min).to(frame.dtype)
+        inputs["fast"] = (shortest >= local.fast_ratio * length(first)).to(frame.dtype)
     inputs |= pixels.lists(
         revealed_inputs(frame, values, lambda f, v: _layers(f, v, engine)["color"])
     )
     moving = length(first) > local.early_out
     ways = _ways(first, second, spread, local)
-    lines = _lines(ways, inputs["linear"] > 0, moving, local)
+    lines = _lines(ways, inputs.get("linear"), moving, local)
     sums = _gather(ways, lines, inputs, pixels, local, engine, first_channel)
     image = _resolve(here, sums, spread, moving, local).images(frame, pixels)
     if values.post_filter:
@@ -195,7 +199,7 @@ def _ways(first: Tensor, second: Tensor, spread: Spread, values: Values) -> dict
 
 
 def _lines(
-    ways: dict[str, _Way], linear: Tensor, moving: Tensor, values: Values
+    ways: dict[str, _Way], linear: Tensor | None, moving: Tensor, values: Values
 ) -> dict[str, Line]:
     """Return where each direction is sampled, and how densely if in pairs."""
     pairs = num_pairs(values)
@@ -203,9 +207,11 @@ def _lines(
     if len(ways) > 1:
         ways = {name: way for name, way in ways.items() if name != "reversed"}
     for number, (name, way) in enumerate(ways.items()):
-        plane, most, used = tap_counts(values, way.reach, pairs), pairs, moving
-        if number == 0 and values.double_samples and values.sampling == "pairs":
-            plane, most = torch.where(linear, plane, 2 * plane), 2 * pairs
+        plane, most, used = torch.full_like(way.reach, float(pairs)), pairs, moving
+        if values.sampling == "pairs":
+            plane = tap_counts(values, way.reach, pairs)
+            if number == 0 and values.double_samples and linear is not None:
+                plane, most = torch.where(linear > 0, plane, 2 * plane), 2 * pairs
         if name == "second" and "first" in ways:
             cosine = (ways["first"].unit * way.unit).sum(1, keepdim=True).abs()
             apart = cosine < torch.cos(values.min_angle * (math.pi / 180))
@@ -244,7 +250,7 @@ def _gather(
         return found
     name, way = next(iter(ways.items()))
     line = lines[name]
-    count = torch.full_like(line.pairs, float(values.num_samples))
+    count = torch.full_like(way.reach, float(values.num_samples))
     inputs, timed = dict(shared), values.sampling == "times"
     for name, one in ways.items():
         inputs |= components(f"{name}_vector", one.vector) if timed else one.line(f"{name}_")

@@ -75,8 +75,9 @@ class ReachConfig(FilterConfig):
     )] = 0.0
     max_samples: Annotated[int, Param(
         unit="taps", low=1, high=1024, scale="log", grad="discrete", source="torchblur",
-        meaning="tap_spacing: most taps of a path",
-    )] = 128
+        meaning="tap_spacing: most taps of a path; longer ones than max_samples * tap_spacing have "
+                "them farther apart",
+    )] = 512
 # fmt: on
 
 

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from torchblur.filters.base import Values
-from torchblur.filters.reach import ReachingBlur, by_length, longest_spread
+from torchblur.filters.reach import ReachingBlur, by_length, longest_spread, tap_counts
 from torchblur.filters.reconstruction import (
     WEIGHT_PARAMETERS,
     ReconstructionConfig,
@@ -179,7 +179,8 @@ def _layers(frame: Frame, values: Values, engine: Engine) -> dict[str, Tensor]:
         layers.setdefault("first_pass", color)
         layers.setdefault("weight", weight)
         frame = frame.replaced(color=color)
-        scale, center = scale * values.pass_spread / values.num_samples, 0
+        taps = tap_counts(values, length(dominant), values.num_samples)
+        scale, center = scale * values.pass_spread / taps, 0
     return layers | {"color": color}
 
 
