@@ -63,7 +63,7 @@ def special_case(name: str, config: FilterConfig | None = None, **params: Any) -
     kind = get_filter(name).config_class
     start = {} if config is None else config.model_dump()
     published = build(kind, start | params, name)
-    return build(ComposedConfig, SPECIAL_CASES[name](published), f"torchblur, as {name}")
+    return build(ComposedConfig, SPECIAL_CASES[name](published), f"composed, as {name}")
 
 
 def _shared(config: FilterConfig, *names: str) -> dict[str, Any]:

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from torchblur.configured import batch_size_of
 from torchblur.filters.base import Values
+from torchblur.filters.front_back import Blurred, compose
 from torchblur.filters.moving import (
     least_spread,
     moving_among,
@@ -18,14 +19,7 @@ from torchblur.filters.moving import (
     tile_planes,
 )
 from torchblur.filters.notes2025_config import Notes2025Config
-from torchblur.filters.notes2025_gather import (
-    SHARED_PARAMETERS,
-    Blurred,
-    Line,
-    compose,
-    gather_line,
-    shared_inputs,
-)
+from torchblur.filters.notes2025_gather import SHARED_PARAMETERS, Line, gather_line, shared_inputs
 from torchblur.filters.notes2025_postfilter import post_filter
 from torchblur.filters.places import num_pairs
 from torchblur.filters.reach import ReachingBlur, code_range, longest_spread, tap_counts

@@ -8,7 +8,8 @@ import torch
 from torch import Tensor
 
 from torchblur.filters.base import Values
-from torchblur.filters.notes2025_gather import Blurred, Line
+from torchblur.filters.front_back import Blurred
+from torchblur.filters.notes2025_gather import Line
 from torchblur.filters.places import num_pairs
 from torchblur.filters.reach import tap_counts
 from torchblur.frame import Frame
