@@ -1,4 +1,4 @@
-"""Consecutive frames of one folder as a `Sequence`, with one error for whatever does not fit."""
+"""Consecutive frames as a `FrameSequence`, with one error for whatever does not fit."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from torchblur.errors import FileFormatError
-from torchblur.frame import Frame, Sequence
+from torchblur.frame import Frame, FrameSequence
 from torchblur.io.frames import read_frame
 from torchblur.io.sequences import FrameFiles, find_frames
 
@@ -25,7 +25,7 @@ def read_sequence(
     numbers: tuple[int, int] | None = None,
     needs: Iterable[str] = ("time",),
     **options: Any,
-) -> Sequence:
+) -> FrameSequence:
     """Read consecutive frames in the order of their numbers.
 
     Args:
@@ -34,7 +34,7 @@ def read_sequence(
         name: Which of a folder's files: "stream", one of several samples per pixel ("stream01"),
             "center", or the name of another sequence.
         cuts: Positions in the sequence of the frames that begin a new shot, from 0, as in
-            `Sequence`.
+            `FrameSequence`.
         numbers: First and last frame number to be read; all if left out.
         needs: Layers beside color and velocity that every frame must have, such as a filter's
             `needs`; ``()`` for frames that are no stream.
@@ -64,7 +64,7 @@ def read_sequence(
                 f"{columns}x{rows}, {each.path} is {width}x{height}"
             )
         frames.append(frame)
-    return Sequence(tuple(frames), tuple(cuts))
+    return FrameSequence(tuple(frames), tuple(cuts))
 
 
 def _between(
