@@ -6,7 +6,7 @@ import torch
 
 import torchblur
 from torchblur.errors import ConfigError, OutputError, TorchblurError
-from torchblur.filters import registered_filters
+from torchblur.filters import list_filters
 from torchblur.presets import Preset, create_filter, load_preset, save_preset
 from torchblur.testing.frames import moving_square
 
@@ -14,7 +14,7 @@ from torchblur.testing.frames import moving_square
 def test_every_filter_has_a_config_and_every_config_loads(repository):
     folder = repository / "configs" / "filters"
     loaded = {path.stem: load_preset(path).filter for path in folder.rglob("*.yaml")}
-    assert set(registered_filters()) <= set(loaded)
+    assert set(list_filters()) <= set(loaded)
     for stem, name in loaded.items():
         assert stem.startswith(name)
         create_filter(folder / f"{stem}.yaml")

@@ -15,7 +15,7 @@ from typing import Any
 from pydantic import Field
 
 from torchblur.errors import ConfigError
-from torchblur.filters import BlurFilter, get_filter, registered_filters
+from torchblur.filters import BlurFilter, get_filter, list_filters
 from torchblur.io.yaml import load_yaml, save_yaml
 from torchblur.ops.compiling import EngineChoice
 from torchblur.ops.gather import Storage
@@ -101,7 +101,7 @@ def create_filter(
         Guertin2014Blur(num_samples=15, kappa=30.0)
     """
     name = str(name_or_preset)
-    if name not in registered_filters() and (Path(name).suffix or Path(name).exists()):
+    if (Path(name).suffix or Path(name).exists()) and name not in list_filters():
         preset = load_preset(name)
         name, params = preset.filter, preset.params | params
     return get_filter(name)(None, engine=engine, storage=storage, **params)

@@ -14,7 +14,7 @@ from typing import Any
 from pydantic import Field, create_model, field_validator
 
 from torchblur.errors import ConfigError, nearest_name
-from torchblur.filters import get_filter, registered_filters
+from torchblur.filters import get_filter, list_filters
 from torchblur.io import load_yaml
 from torchblur.ops.compiling import EngineChoice
 from torchblur.params import Config, build, choices, declared
@@ -200,7 +200,7 @@ def free_names(config: TuneConfig, index: int, place: str = "") -> tuple[str, ..
 
 
 def _without_preset(spec: FilterSpec, place: str, folder: Path) -> FilterSpec:
-    if spec.kind in registered_filters():
+    if spec.kind in list_filters():
         return spec
     if not spec.kind.endswith((".yaml", ".yml")):
         try:

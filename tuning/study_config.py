@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, field_validator
 
 from torchblur.errors import ConfigError, nearest_name
-from torchblur.filters import BlurFilter, TemporalBlur, get_filter, registered_filters
+from torchblur.filters import BlurFilter, TemporalBlur, get_filter, list_filters
 from torchblur.frame import Shutter, ShutterPosition
 from torchblur.io import load_yaml
 from torchblur.params import Config, build
@@ -237,7 +237,7 @@ def _with_path(item: StudyScene | StudyExr, folder: Path, place: str) -> StudySc
 
 def _with_preset(variant: StudyVariant, folder: Path, place: str) -> StudyVariant:
     name = variant.filter
-    if name is None or name in registered_filters():
+    if name is None or name in list_filters():
         return variant
     if not name.endswith((".yaml", ".yml")):
         try:

@@ -5,7 +5,7 @@ import torch
 from planted import FIXED, PLANTED, planted_case
 
 from torchblur.errors import ConfigError
-from torchblur.filters import BlurFilter, get_filter, registered_filters
+from torchblur.filters import BlurFilter, get_filter, list_filters
 from torchblur.filters.base import FilterConfig
 from torchblur.params import declared
 from tuning.config import ObjectiveSpec
@@ -34,7 +34,7 @@ TAPS = {
 
 
 def _counted():
-    return [(n, p) for n, names in TAPS.items() if n in registered_filters() for p in names]
+    return [(n, p) for n, names in TAPS.items() if n in list_filters() for p in names]
 
 
 def test_guertin_as_published_is_the_unit():
@@ -92,7 +92,7 @@ def test_counts_what_makes_a_filter_dear(name, cheap, dear):
 
 
 def test_smooth_parameters_cost_nothing():
-    for name, kind in registered_filters().items():
+    for name, kind in list_filters().items():
         if name not in TAPS:
             continue
         smooth = {
@@ -102,7 +102,7 @@ def test_smooth_parameters_cost_nothing():
 
 
 def test_every_filter_has_a_cost():
-    for name in registered_filters():
+    for name in list_filters():
         assert cost_of(name).total > 0
 
 
@@ -116,7 +116,7 @@ def test_a_filter_may_state_its_own(monkeypatch):
 
 
 def test_an_unknown_cost_says_so(monkeypatch):
-    monkeypatch.setattr("torchblur.filters.base._REGISTRY", {})
+    monkeypatch.setattr("torchblur.filters.registry._REGISTRY", {})
 
     class Odd(BlurFilter):
         name = "odd"

@@ -1,4 +1,4 @@
-"""What all filters share: the shutter, the Module over a function, the registry.
+"""What all filters share: the shutter, and the Module over a function.
 
 A filter is three things in one file: a `FilterConfig` (its parameters, each declared once), a
 function of a frame and the parameters' values, and a `BlurFilter` that holds the values as
@@ -16,24 +16,16 @@ from typing import Annotated, Any, ClassVar, get_args
 from torch import Tensor
 
 from torchblur.configured import ConfiguredModule, Values, batch_size_of
-from torchblur.errors import ConfigError, nearest_name
-from torchblur.frame import LONGEST_SHUTTER, Frame, Sequence, Shutter, ShutterPosition
+from torchblur.errors import ConfigError
+from torchblur.filters.registry import register_filter
+from torchblur.frame import LONGEST_SHUTTER, Frame, FrameSequence, Shutter, ShutterPosition
 from torchblur.ops.compiling import EngineChoice, compiler_works, worth_compiling
 from torchblur.ops.gather import Engine, Storage, stored_as
 from torchblur.params import Config, Param
 
-__all__ = [
-    "BlurFilter",
-    "FilterConfig",
-    "History",
-    "TemporalBlur",
-    "Values",
-    "get_filter",
-    "registered_filters",
-]
+__all__ = ["BlurFilter", "FilterConfig", "History", "TemporalBlur", "Values"]
 
 _TAPS = 16  # of a filter that does not say how many it has
-_REGISTRY: dict[str, type[BlurFilter]] = {}
 
 
 class FilterConfig(Config):
@@ -94,7 +86,7 @@ class BlurFilter(ConfiguredModule):
     def __init_subclass__(cls, **kwargs: Any) -> None:
         super().__init_subclass__(**kwargs)
         if "name" in cls.__dict__:
-            _REGISTRY[cls.name] = cls
+            register_filter(cls)
 
     def __init__(
         self,
@@ -262,7 +254,7 @@ class TemporalBlur(BlurFilter):
         return layers["color"], history
 
     def sequence(
-        self, sequence: Sequence, *, detach_every: int | None = None, **overrides: Any
+        self, sequence: FrameSequence, *, detach_every: int | None = None, **overrides: Any
     ) -> list[Tensor]:
         """Return the blurred color of each frame, (B, 3, H, W) each; memory ends at cuts.
 
@@ -289,22 +281,3 @@ class TemporalBlur(BlurFilter):
                 history = history.detach()
             colors.append(color)
         return colors
-
-
-def registered_filters() -> dict[str, type[BlurFilter]]:
-    """Return the filters by name."""
-    return dict(sorted(_REGISTRY.items()))
-
-
-def get_filter(name: str) -> type[BlurFilter]:
-    """Return a filter's class by its registered name.
-
-    Raises:
-        ConfigError: if there is none; names the nearest.
-    """
-    if name not in _REGISTRY:
-        raise ConfigError(
-            f"unknown filter `{name}`{nearest_name(name, _REGISTRY)}; "
-            f"filters: {', '.join(sorted(_REGISTRY))}"
-        )
-    return _REGISTRY[name]
