@@ -13,6 +13,7 @@ The names here are the stable ones; docs/stability.md says how they may change.
 
 from typing import TYPE_CHECKING
 
+from torchblur.batching import collate
 from torchblur.deprecation import old_names
 from torchblur.errors import (
     ConfigError,
@@ -55,6 +56,7 @@ __all__ = [
     "Shutter",
     "TemporalBlur",
     "TorchblurError",
+    "collate",
     "create_filter",
     "create_pipeline",
     "get_filter",
