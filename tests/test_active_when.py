@@ -3,13 +3,13 @@
 import pytest
 import torch
 
-from torchblur.filters import get_filter, registered_filters
+from torchblur.filters import get_filter, list_filters
 from torchblur.params import Param, choices, declared, idle
 from torchblur.testing.frames import as_stream, moving_square
 
 WAITING = [
     (name, parameter)
-    for name, kind in registered_filters().items()
+    for name, kind in list_filters().items()
     for parameter, spec in declared(kind.config_class).items()
     if spec.active_when
 ]
