@@ -7,8 +7,8 @@ from typing import Annotated, Any, ClassVar
 import torch
 import torch.nn.functional as F
 
-from torchblur.filters.base import FilterConfig, History, TemporalBlur
-from torchblur.filters.registry import _REGISTRY
+from torchblur.filters.parts.base import FilterConfig, History, TemporalBlur
+from torchblur.filters.parts.registry import _REGISTRY
 from torchblur.frame import Frame, FrameSequence, Shutter
 from torchblur.io import write_frame, write_image
 from torchblur.metrics import border_band

@@ -16,7 +16,7 @@ from pydantic import Field
 
 from torchblur.errors import ConfigError
 from torchblur.filters import BlurFilter, get_filter, list_filters
-from torchblur.filters.base import with_shutter
+from torchblur.filters.parts.base import with_shutter
 from torchblur.io.yaml import load_yaml, save_yaml
 from torchblur.ops.compiling import EngineChoice
 from torchblur.ops.gather import Storage

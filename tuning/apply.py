@@ -12,7 +12,7 @@ from torch import Tensor
 
 from torchblur.errors import ConfigError, FileFormatError, OutputError, nearest_name
 from torchblur.filters import BlurFilter
-from torchblur.filters.base import History, TemporalBlur
+from torchblur.filters.parts.base import History, TemporalBlur
 from torchblur.frame import Frame
 from torchblur.io import ConventionOverrides, get_convention, read_frame
 from torchblur.ops.compiling import EngineChoice

@@ -18,7 +18,7 @@ from typing import Any
 from pydantic import Field
 
 from torchblur.errors import ConfigError, OutputError
-from torchblur.filters.base import TemporalBlur
+from torchblur.filters.parts.base import TemporalBlur
 from torchblur.io import load_yaml
 from torchblur.params import build
 from tuning.apply import FilterSettings, make_filter, recipe_of, samples_beside

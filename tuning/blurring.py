@@ -12,8 +12,8 @@ import torch
 from torch import Tensor
 
 from torchblur.filters import BlurFilter
-from torchblur.filters.base import TemporalBlur
-from torchblur.filters.reach import ReachingBlur
+from torchblur.filters.parts.base import TemporalBlur
+from torchblur.filters.parts.reach import ReachingBlur
 from torchblur.frame import Frame
 
 __all__ = ["arguments", "blurred", "blurred_sequence"]

@@ -19,7 +19,7 @@ from torch import Tensor
 
 from torchblur.errors import ConfigError
 from torchblur.filters import BlurFilter, get_filter
-from torchblur.filters.base import FilterConfig
+from torchblur.filters.parts.base import FilterConfig
 from torchblur.params import build
 
 __all__ = ["Cost", "cost_at", "cost_of"]

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from torchblur.errors import ConfigError, FrameError, OutputError
 from torchblur.filters import BlurFilter
-from torchblur.filters.base import TemporalBlur
+from torchblur.filters.parts.base import TemporalBlur
 from torchblur.frame import Frame
 from torchblur.params import build
 from tuning.apply import (

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import torch
 
 from torchblur.filters import list_filters
-from torchblur.filters.reach import Cut, ReachingBlur
+from torchblur.filters.parts.reach import Cut, ReachingBlur
 from torchblur.frame import Frame
 from torchblur.presets import DEFAULT_FILTER
 

@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 
 from torchblur.filters import BlurFilter
-from torchblur.filters.base import History, TemporalBlur
+from torchblur.filters.parts.base import History, TemporalBlur
 from torchblur.frame import Frame
 from torchblur.ops.compiling import compiler_works
 from tuning.apply import FilterSettings, blur_frame, blur_step, read_samples, write_job

@@ -12,8 +12,8 @@ import torch
 from torch import Tensor
 
 from torchblur.filters import BlurFilter, get_filter
-from torchblur.filters.base import Values
-from torchblur.filters.spreads import spread_of
+from torchblur.filters.parts.base import Values
+from torchblur.filters.parts.spreads import spread_of
 from torchblur.frame import Frame, Shutter
 from torchblur.ops.raymask import edge_strength, ray_mask, uncovered
 from torchblur.render import render_revealed

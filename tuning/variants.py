@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from torchblur.filters import BlurFilter
-from torchblur.filters.reach import Cut, ReachingBlur
+from torchblur.filters.parts.reach import Cut, ReachingBlur
 from tuning.blurring import arguments, blurred, blurred_sequence
 from tuning.cases import AnyCase, Case, SequenceCase
 

@@ -11,7 +11,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from torchblur.filters import BlurFilter
-from torchblur.filters.reach import ReachingBlur
+from torchblur.filters.parts.reach import ReachingBlur
 from torchblur.frame import Frame, Shutter
 from tuning.cases import AnyCase, Case
 from tuning.data_config import Crops

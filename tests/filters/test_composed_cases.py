@@ -8,7 +8,7 @@ import torch
 from torchblur.errors import ConfigError
 from torchblur.filters import get_filter
 from torchblur.filters.composed import ComposedBlur
-from torchblur.filters.composed_cases import SPECIAL_CASES, special_case
+from torchblur.filters.composed.cases import SPECIAL_CASES, special_case
 from torchblur.frame import Frame
 from torchblur.io import read_frame
 from torchblur.testing.frames import constant_motion, moving_square, random_frame

@@ -4,8 +4,8 @@ import pytest
 import torch
 
 from torchblur.errors import FrameError
-from torchblur.filters.base import History
 from torchblur.filters.oberberger2022 import Oberberger2022Blur, oberberger2022
+from torchblur.filters.parts.base import History
 from torchblur.frame import Frame, FrameSequence
 from torchblur.testing.contract import FilterContract
 from torchblur.testing.frames import as_stream, moving_square, random_frame

@@ -5,10 +5,10 @@ import torch
 
 from torchblur.errors import ReachWarning
 from torchblur.filters import get_filter
-from torchblur.filters import reach as reach_module
-from torchblur.filters.base import Values
-from torchblur.filters.moving import least_spread
-from torchblur.filters.reach import by_length, tap_counts
+from torchblur.filters.parts import reach as reach_module
+from torchblur.filters.parts.base import Values
+from torchblur.filters.parts.moving import least_spread
+from torchblur.filters.parts.reach import by_length, tap_counts
 from torchblur.frame import Frame
 from torchblur.ops import gather as gather_module
 from torchblur.ops.pixels import PixelList

@@ -9,7 +9,7 @@ import pytest
 import torchblur
 from torchblur.errors import ConfigError, FileFormatError
 from torchblur.filters import FilterConfig, get_filter, list_filters, load_plugin, register_filter
-from torchblur.filters import registry as registry_module
+from torchblur.filters.parts import registry as registry_module
 from torchblur.testing.frames import moving_square
 
 PLUGIN = """

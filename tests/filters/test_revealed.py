@@ -6,7 +6,7 @@ from layered import disk_scene
 
 from torchblur.errors import FrameError
 from torchblur.filters import get_filter
-from torchblur.filters.revealed import behind_slope, share_behind
+from torchblur.filters.parts.revealed import behind_slope, share_behind
 from torchblur.frame import Frame, Shutter
 from torchblur.io import read_frame, read_image
 from torchblur.metrics import border_band, evaluate

@@ -6,7 +6,7 @@ from planted import FIXED, PLANTED, planted_case
 
 from torchblur.errors import ConfigError
 from torchblur.filters import BlurFilter, get_filter, list_filters
-from torchblur.filters.base import FilterConfig
+from torchblur.filters.parts.base import FilterConfig
 from torchblur.params import declared
 from tuning.config import ObjectiveSpec
 from tuning.cost import Cost, cost_at, cost_of
@@ -116,7 +116,7 @@ def test_a_filter_may_state_its_own(monkeypatch):
 
 
 def test_an_unknown_cost_says_so(monkeypatch):
-    monkeypatch.setattr("torchblur.filters.registry._REGISTRY", {})
+    monkeypatch.setattr("torchblur.filters.parts.registry._REGISTRY", {})
 
     class Odd(BlurFilter):
         name = "odd"

@@ -322,9 +322,9 @@ import signal, sys, time
 # A shell starts its background jobs with SIGINT ignored, and so these tests when it runs them.
 signal.signal(signal.SIGINT, signal.default_int_handler)
 sys.path.insert(0, TESTS)
-import torchblur.filters.registry
+import torchblur.filters.parts.registry
 from planted_sequences import Recall
-torchblur.filters.registry._REGISTRY["recall"] = Recall
+torchblur.filters.parts.registry._REGISTRY["recall"] = Recall
 import tuning.runner
 original = tuning.runner.blur_step
 def slow(*args):

@@ -1,4 +1,4 @@
-"""Published motion-blur filters, one file each: a function, a Module and its config.
+"""Motion-blur filters, one file or folder each; `parts` has what they share.
 
 Every module of this package is imported here, so that a new file registers its filter by itself.
 """
@@ -6,9 +6,9 @@ Every module of this package is imported here, so that a new file registers its 
 from importlib import import_module
 from pkgutil import iter_modules
 
-from torchblur.filters.base import BlurFilter, FilterConfig, History, TemporalBlur
-from torchblur.filters.registry import get_filter, list_filters, load_plugin, register_filter
-from torchblur.filters.registry import registered_filters as registered_filters
+from torchblur.filters.parts.base import BlurFilter, FilterConfig, History, TemporalBlur
+from torchblur.filters.parts.registry import get_filter, list_filters, load_plugin, register_filter
+from torchblur.filters.parts.registry import registered_filters as registered_filters
 from torchblur.filters.two_pass import TwoPassBlur
 
 for _module in iter_modules(__path__):

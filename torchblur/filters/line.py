@@ -7,7 +7,7 @@ from typing import Annotated, Any, NamedTuple
 import torch
 from torch import Tensor
 
-from torchblur.filters.base import BlurFilter, FilterConfig, Values
+from torchblur.filters.parts.base import BlurFilter, FilterConfig, Values
 from torchblur.frame import LONGEST_SHUTTER, Frame, Shutter
 from torchblur.ops.gather import (
     Engine,

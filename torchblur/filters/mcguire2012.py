@@ -7,18 +7,18 @@ from typing import Annotated, Any, NamedTuple
 import torch
 from torch import Tensor
 
-from torchblur.filters.base import Values
-from torchblur.filters.moving import Filtered, Moving, moving_part, revealed_part
-from torchblur.filters.reach import ReachingBlur, by_length
-from torchblur.filters.reconstruction import (
+from torchblur.filters.parts.base import Values
+from torchblur.filters.parts.moving import Filtered, Moving, moving_part, revealed_part
+from torchblur.filters.parts.reach import ReachingBlur, by_length
+from torchblur.filters.parts.reconstruction import (
     WEIGHT_PARAMETERS,
     ReconstructionConfig,
     is_one,
     resolve,
     sample,
 )
-from torchblur.filters.revealed import RevealedBackgroundConfig
-from torchblur.filters.spreads import tiles_of
+from torchblur.filters.parts.revealed import RevealedBackgroundConfig
+from torchblur.filters.parts.spreads import tiles_of
 from torchblur.frame import Frame, Shutter
 from torchblur.ops.gather import (
     Engine,

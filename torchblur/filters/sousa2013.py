@@ -7,9 +7,9 @@ from typing import Annotated, Any, Literal, NamedTuple
 import torch
 from torch import Tensor
 
-from torchblur.filters.base import Values
-from torchblur.filters.reach import ReachingBlur, by_length, longest_spread, tap_counts
-from torchblur.filters.reconstruction import (
+from torchblur.filters.parts.base import Values
+from torchblur.filters.parts.reach import ReachingBlur, by_length, longest_spread, tap_counts
+from torchblur.filters.parts.reconstruction import (
     WEIGHT_PARAMETERS,
     ReconstructionConfig,
     color_from,
@@ -18,7 +18,7 @@ from torchblur.filters.reconstruction import (
     sample,
     texture_of,
 )
-from torchblur.filters.spreads import Spread, Tiles, around_tiles, spread_of
+from torchblur.filters.parts.spreads import Spread, Tiles, around_tiles, spread_of
 from torchblur.frame import Frame, Shutter
 from torchblur.ops.gather import (
     Engine,

@@ -8,7 +8,7 @@ from typing import Any
 from torch import Tensor, nn
 
 from torchblur.errors import ConfigError
-from torchblur.filters.base import BlurFilter, TemporalBlur, with_shutter
+from torchblur.filters.parts.base import BlurFilter, TemporalBlur, with_shutter
 from torchblur.frame import Frame
 from torchblur.params import Param, declared
 

@@ -1,0 +1,1 @@
+"""What filters are made of: the Module and its registry, reach, tiles, taps, sums."""
