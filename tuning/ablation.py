@@ -22,10 +22,10 @@ from torchblur.frame import LONGEST_SHUTTER, ShutterPosition
 from torchblur.io import load_yaml
 from torchblur.params import Config, build
 from tuning.cases import Case
+from tuning.config.data import DataItem, DataSpec, ExrData, SceneData
+from tuning.config.overrides import apply_overrides
 from tuning.data import load_cases
-from tuning.data_config import DataItem, DataSpec, ExrData, SceneData
 from tuning.evaluation import noise_scores, score_image
-from tuning.overrides import apply_overrides
 from tuning.progress import Progress, Stage
 from tuning.rendering import find_scene
 from tuning.variants import Variant, render

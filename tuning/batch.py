@@ -24,7 +24,7 @@ from torchblur.params import build
 from tuning.apply import FilterSettings, make_filter, recipe_of, samples_beside
 from tuning.cluster import Cluster
 from tuning.cluster_batch import run_on_cluster
-from tuning.config import apply_overrides
+from tuning.config.fit import apply_overrides
 from tuning.engine import files_engine
 from tuning.outputs import (
     Job,

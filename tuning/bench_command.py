@@ -84,7 +84,7 @@ def bench(  # noqa: PLR0913 - each argument is an option
     from tuning.bench_cases import Report
     from tuning.bench_plan import BenchOptions
     from tuning.bench_table import print_report
-    from tuning.overrides import apply_overrides
+    from tuning.config.overrides import apply_overrides
 
     if json_schema:
         typer.echo(json.dumps(Report.model_json_schema(), indent=2))

@@ -23,10 +23,10 @@ from optuna.trial import FrozenTrial, Trial, TrialState, create_trial
 
 from tuning.blackbox_study import make_pruner, make_sampler, new_study, suggest
 from tuning.candidates import evaluate_candidates
+from tuning.config.methods import BlackBoxMethod
 from tuning.fidelity import Climb, Ladder
 from tuning.gradient import FitError, seed_of
 from tuning.job import MethodJob
-from tuning.method_config import BlackBoxMethod
 from tuning.polish import Polished, PolishStart, is_promising, polish
 from tuning.problem import Problem
 from tuning.progress import Progress

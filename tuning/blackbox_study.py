@@ -24,7 +24,7 @@ from optuna.storages import InMemoryStorage, JournalStorage
 from optuna.storages.journal import JournalFileBackend
 from optuna.trial import FrozenTrial, Trial
 
-from tuning.method_config import BlackBoxMethod
+from tuning.config.methods import BlackBoxMethod
 from tuning.runfolder import RunFolder, trim_torn_line
 from tuning.space import FreeParameter
 

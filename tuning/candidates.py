@@ -11,7 +11,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from tuning.objective_config import ObjectiveSpec
+from tuning.config.objective import ObjectiveSpec
 from tuning.problem import Problem
 from tuning.reduction import tail_weights
 from tuning.space import Space

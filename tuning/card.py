@@ -13,8 +13,8 @@ from typing import Any
 from torchblur.filters import get_filter
 from torchblur.params import declared
 from torchblur.presets import Preset
-from tuning.config import TuneConfig
-from tuning.data_config import DataItem
+from tuning.config.data import DataItem
+from tuning.config.fit import TuneConfig
 from tuning.page import Row, Table
 from tuning.pareto_files import front_method
 from tuning.pareto_report import front_section

@@ -20,7 +20,7 @@ from typing import Any, TypeVar
 from torchblur.errors import TorchblurError
 from torchblur.params import build
 from tuning.cluster import Cluster, ClusterError, here, share_cores
-from tuning.config import TuneConfig
+from tuning.config.fit import TuneConfig
 from tuning.preparation import fingerprint, is_same_data, prepare
 from tuning.problem import Problem
 

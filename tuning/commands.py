@@ -168,7 +168,7 @@ def tune(  # noqa: PLR0913 - each argument is an option
     a report with the evidence. A cluster takes the candidates that a search draws together
     (`population`); `torchrun -m tuning tune CONFIG` splits the windows of each step.
     """
-    from tuning.config import load_tune_config
+    from tuning.config.fit import load_tune_config
     from tuning.distributed import RankZeroStoppedError, rank_here
     from tuning.fit import run_fit
     from tuning.printing import print_fit

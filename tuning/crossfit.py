@@ -21,11 +21,11 @@ from torchblur.filters import get_filter
 from torchblur.io.paths import output_file
 from torchblur.params import build
 from tuning.cases import AnyCase, check_needs
-from tuning.config import TuneConfig
+from tuning.config.data import DataItem, DataSpec
+from tuning.config.fit import TuneConfig
 from tuning.crossfit_config import CrossfitConfig
 from tuning.crossfit_tiles import Sums, tile_sums
 from tuning.data import load_cases
-from tuning.data_config import DataItem, DataSpec
 from tuning.methods import run_methods
 from tuning.outputs import make_folders
 from tuning.preparation import fit_device, prepare

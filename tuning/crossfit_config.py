@@ -16,8 +16,7 @@ from torchblur.filters import get_filter
 from torchblur.io import load_yaml
 from torchblur.ops.compiling import EngineChoice
 from torchblur.params import Config, build, declared
-from tuning.config import FilterSpec, FreeRange, TuneConfig, resolve, resolve_filter
-from tuning.data_config import (
+from tuning.config.data import (
     Crops,
     DataItem,
     FamilyData,
@@ -25,9 +24,10 @@ from tuning.data_config import (
     SceneData,
     SceneStreamData,
 )
-from tuning.method_config import Method
-from tuning.objective_config import ObjectiveSpec
-from tuning.overrides import apply_overrides
+from tuning.config.fit import FilterSpec, FreeRange, TuneConfig, resolve, resolve_filter
+from tuning.config.methods import Method
+from tuning.config.objective import ObjectiveSpec
+from tuning.config.overrides import apply_overrides
 from tuning.rendering import find_scene
 
 __all__ = [

@@ -17,7 +17,7 @@ from torchblur.io import read_frame, read_image
 from torchblur.metrics import border_band
 from torchblur.render import Scene, load_scene, render_frame, render_reference
 from tuning.cases import AnyCase, Case, SequenceCase, refuse_repeats, with_unique_names
-from tuning.data_config import (
+from tuning.config.data import (
     DataItem,
     DataSpec,
     ExrData,

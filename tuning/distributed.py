@@ -22,7 +22,7 @@ from torch import Tensor
 from torchblur.errors import TorchblurError
 from torchblur.params import build
 from tuning.cluster import ClusterError
-from tuning.config import TuneConfig
+from tuning.config.fit import TuneConfig
 from tuning.distributed_problem import Request, Shard, ShardedProblem
 from tuning.preparation import fingerprint, is_same_data, prepare
 from tuning.problem import Problem

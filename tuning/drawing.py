@@ -7,7 +7,7 @@ from pathlib import Path
 
 from torchblur.params import build
 from torchblur.render import Scene, draw_scene, load_family
-from tuning.data_config import FamilyData, FamilyStreamData, SceneData, SceneStreamData
+from tuning.config.data import FamilyData, FamilyStreamData, SceneData, SceneStreamData
 
 __all__ = ["drawn_name", "drawn_scenes"]
 

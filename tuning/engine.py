@@ -14,8 +14,8 @@ from torchblur.filters import BlurFilter
 from torchblur.io.exr import read_size
 from torchblur.ops.compiling import GRADIENT_CALLS
 from torchblur.ops.gather import Engine
-from tuning.config import TuneConfig
-from tuning.method_config import GradientMethod, Method, ParetoMethod
+from tuning.config.fit import TuneConfig
+from tuning.config.methods import GradientMethod, Method, ParetoMethod
 from tuning.outputs import Job
 from tuning.problem import Problem
 from tuning.smaller import pixels_of

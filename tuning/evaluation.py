@@ -11,7 +11,7 @@ from torch import Tensor
 from torchblur.filters import BlurFilter
 from torchblur.metrics import evaluate
 from tuning.cases import AnyCase, Case, SequenceCase
-from tuning.config import GradientMethod, ObjectiveSpec
+from tuning.config.fit import GradientMethod, ObjectiveSpec
 from tuning.gradient import GradientJob, fit_gradient
 from tuning.problem import Problem
 from tuning.progress import Stage

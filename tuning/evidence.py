@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from tuning.cases import AnyCase
-from tuning.objective_config import ObjectiveSpec
+from tuning.config.objective import ObjectiveSpec
 from tuning.result import FitResult, height_name
 
 __all__ = ["evidence_of"]

@@ -88,7 +88,7 @@ def _loaded(preset: str, changes: list[str]) -> tuple[Preset, str]:
     from torchblur.filters import get_filter, registered_filters
     from torchblur.params import build
     from torchblur.presets import Preset, load_preset
-    from tuning.overrides import apply_overrides
+    from tuning.config.overrides import apply_overrides
 
     path = Path(preset)
     if preset not in registered_filters() and (path.suffix or path.exists()):

@@ -26,7 +26,7 @@ from torch import Tensor
 
 from torchblur.errors import ConfigError
 from tuning.candidates import Evaluated, evaluate_candidates, reduced
-from tuning.method_config import PruningSpec
+from tuning.config.methods import PruningSpec
 from tuning.problem import Problem
 from tuning.smaller import pixels_of
 from tuning.space import Space

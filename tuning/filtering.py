@@ -23,7 +23,7 @@ from tuning.apply import (
     samples_beside,
     write_job,
 )
-from tuning.config import apply_overrides
+from tuning.config.fit import apply_overrides
 from tuning.engine import files_engine
 from tuning.images import read_color
 from tuning.judging import Scores, SequenceJudge, asked_name, judge, mean_scores

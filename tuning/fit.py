@@ -19,7 +19,7 @@ from torchblur.presets import Preset, save_preset
 from tuning.cases import AnyCase, SequenceCase
 from tuning.cluster import Cluster, ClusterError
 from tuning.cluster_problem import ClusterProblem
-from tuning.config import GradientMethod, TuneConfig, resolve
+from tuning.config.fit import GradientMethod, TuneConfig, resolve
 from tuning.distributed import is_restarted, join_ranks
 from tuning.evaluation import ceiling, score_cases, score_variant
 from tuning.evidence import evidence_of

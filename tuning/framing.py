@@ -13,8 +13,8 @@ import torch
 from torchblur.frame import Shutter
 from torchblur.metrics import border_band
 from torchblur.render import Renderer, Scene
+from tuning.config.framing import Framed
 from tuning.frame_cache import cache_key, cached
-from tuning.framing_config import Framed
 from tuning.windows import MOVING
 
 __all__ = ["Box", "busiest_box", "cached_box", "find_box", "seen_through", "view_of"]

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from torchblur.errors import TorchblurError
-from tuning.config import GradientMethod
+from tuning.config.fit import GradientMethod
 from tuning.job import MethodJob
 from tuning.problem import Problem
 from tuning.space import Space

@@ -12,7 +12,7 @@ from torch import Tensor
 from torchblur.filters import BlurFilter
 from torchblur.frame import Frame
 from tuning.blurring import arguments, blurred, blurred_sequence
-from tuning.config import ObjectiveSpec
+from tuning.config.fit import ObjectiveSpec
 from tuning.meter import Meter
 from tuning.objective import PreparedObjective, prepare_objective
 from tuning.windows import AnySample, Sample, SequenceSample

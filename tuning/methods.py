@@ -7,9 +7,9 @@ from typing import Any
 from torchblur.filters import get_filter
 from torchblur.params import declared
 from tuning.blackbox import BlackBoxJob, fit_blackbox
-from tuning.config import TuneConfig, free_names
+from tuning.config.fit import TuneConfig, free_names
+from tuning.config.methods import GradientMethod, ParetoMethod, polished_names
 from tuning.gradient import GradientJob, fit_gradient, seed_of
-from tuning.method_config import GradientMethod, ParetoMethod, polished_names
 from tuning.pareto import ParetoJob, fit_pareto
 from tuning.pool import Pool
 from tuning.problem import Problem

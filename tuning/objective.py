@@ -16,7 +16,7 @@ from torchblur.metrics import (
     ssim,
     temporal_error,
 )
-from tuning.objective_config import ObjectiveSpec
+from tuning.config.objective import ObjectiveSpec
 
 __all__ = ["PreparedObjective", "prepare_objective"]
 

@@ -22,10 +22,10 @@ from optuna.trial import FrozenTrial, Trial, TrialState, create_trial
 
 from tuning.blackbox_study import new_study, suggest
 from tuning.candidates import evaluate_candidates
-from tuning.cost import cost_at
+from tuning.config.cost import cost_at
+from tuning.config.methods import ParetoMethod
 from tuning.gradient import FitError, seed_of
 from tuning.job import MethodJob
-from tuning.method_config import ParetoMethod
 from tuning.pareto_result import ParetoPoint, ParetoResult, front_of, make_point, pick
 from tuning.polish import Polished, PolishStart, polish
 from tuning.problem import Problem

@@ -10,7 +10,7 @@ from typing import Any
 from torchblur.filters import get_filter
 from torchblur.presets import Preset, save_preset
 from tuning.cases import AnyCase
-from tuning.config import TuneConfig
+from tuning.config.fit import TuneConfig
 from tuning.evidence import evidence_of
 from tuning.pareto_plots import front_png
 from tuning.pareto_result import ParetoPick, ParetoPoint, ParetoResult

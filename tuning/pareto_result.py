@@ -8,7 +8,7 @@ from typing import Any, Literal
 from pydantic import Field
 
 from torchblur.params import Config
-from tuning.cost import Cost
+from tuning.config.cost import Cost
 
 __all__ = ["Origin", "ParetoPick", "ParetoPoint", "ParetoResult", "front_of", "make_point", "pick"]
 

@@ -7,7 +7,7 @@ from typing import Any
 
 from torchblur.filters import BlurFilter, get_filter
 from tuning.cases import AnyCase
-from tuning.cost import cost_at
+from tuning.config.cost import cost_at
 from tuning.pareto_result import Origin, ParetoPoint, make_point
 from tuning.problem import Problem
 from tuning.progress import Progress, Stage

@@ -13,8 +13,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from tuning.config.methods import GradientMethod, PolishSteps
 from tuning.gradient import FitError, GradientJob, fit_gradient
-from tuning.method_config import GradientMethod, PolishSteps
 from tuning.problem import Problem
 from tuning.space import Space
 

@@ -20,11 +20,11 @@ from dataclasses import dataclass
 
 from torchblur.errors import ConfigError
 from tuning.cases import AnyCase
+from tuning.config.data import DataSpec, FamilyData, FamilyStreamData
+from tuning.config.methods import RefreshSpec
 from tuning.data import draw_cases
-from tuning.data_config import DataSpec, FamilyData, FamilyStreamData
 from tuning.distributed_problem import ShardedProblem
 from tuning.gradient_state import seed_of
-from tuning.method_config import RefreshSpec
 from tuning.problem import Problem
 from tuning.windows import AnySample, make_samples
 

@@ -12,7 +12,7 @@ import torch
 from torchblur.errors import ConfigError
 from torchblur.filters import BlurFilter, get_filter
 from tuning.cases import AnyCase, check_needs
-from tuning.config import TuneConfig
+from tuning.config.fit import TuneConfig
 from tuning.data import load_cases
 from tuning.engine import fit_engine
 from tuning.problem import Problem

@@ -9,10 +9,10 @@ import torch
 from torch import Tensor
 
 from torchblur.filters import BlurFilter
-from tuning.cost import cost_at
+from tuning.config.cost import cost_at
+from tuning.config.objective import ObjectiveSpec
 from tuning.groups import AnyGroup, join, kind_of
 from tuning.meter import Meter
-from tuning.objective_config import ObjectiveSpec
 from tuning.reduction import tail_weights
 from tuning.smaller import smaller
 from tuning.windows import AnySample

@@ -20,8 +20,8 @@ from typing import Any
 
 from torchblur.errors import ConfigError
 from tuning.cases import AnyCase, Case
-from tuning.config import TuneConfig, resolve
-from tuning.method_config import GradientMethod
+from tuning.config.fit import TuneConfig, resolve
+from tuning.config.methods import GradientMethod
 from tuning.methods import run_methods
 from tuning.preparation import prepare
 from tuning.problem import Problem

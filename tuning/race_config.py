@@ -12,11 +12,11 @@ from torchblur.errors import ConfigError, nearest_name
 from torchblur.filters import get_filter
 from torchblur.io import load_yaml
 from torchblur.params import Config, build, declared
-from tuning.config import FilterSpec, TuneConfig, resolve
-from tuning.data_config import DataSpec
-from tuning.method_config import GradientMethod, Method
-from tuning.objective_config import ObjectiveSpec
-from tuning.overrides import apply_overrides
+from tuning.config.data import DataSpec
+from tuning.config.fit import FilterSpec, TuneConfig, resolve
+from tuning.config.methods import GradientMethod, Method
+from tuning.config.objective import ObjectiveSpec
+from tuning.config.overrides import apply_overrides
 
 __all__ = ["Entrant", "RaceConfig", "RaceProblem", "load_race_config"]
 

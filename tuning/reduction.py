@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from tuning.objective_config import ObjectiveSpec
+from tuning.config.objective import ObjectiveSpec
 
 __all__ = ["tail_weights"]
 

@@ -16,8 +16,8 @@ from torchblur.frame import LONGEST_SHUTTER, Shutter, ShutterPosition
 from torchblur.io import write_frame, write_image
 from torchblur.params import build
 from torchblur.render import Renderer, Scene, load_scene
+from tuning.config.framing import Framed
 from tuning.framing import find_box, seen_through, view_of
-from tuning.framing_config import Framed
 from tuning.outputs import made_by, make_folders, remove_leftovers, state_of
 from tuning.progress import Progress, Stage
 

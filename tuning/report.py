@@ -14,7 +14,7 @@ from markupsafe import Markup
 from torchblur.filters import get_filter
 from torchblur.params import Param
 from tuning.cases import AnyCase, SequenceCase
-from tuning.config import TuneConfig
+from tuning.config.fit import TuneConfig
 from tuning.page import Column, Row, Table, View, make_view, render_page
 from tuning.pareto_report import front_section, preset_names
 from tuning.plots import loss_curves, parameter_paths

@@ -16,7 +16,7 @@ import torch
 
 from torchblur.errors import ConfigError, OutputError
 from torchblur.io import load_yaml, save_yaml
-from tuning.config import TuneConfig
+from tuning.config.fit import TuneConfig
 
 __all__ = ["RunFolder", "open_run", "trim_torn_line"]
 

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from torchblur.filters import get_filter
 from torchblur.params import Param, choices, declared
-from tuning.config import FilterSpec
+from tuning.config.fit import FilterSpec
 
 __all__ = ["FreeParameter", "Space", "make_space"]
 

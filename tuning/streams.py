@@ -18,7 +18,7 @@ from torchblur.io import read_frame, read_image
 from torchblur.metrics import border_band
 from torchblur.render import Scene, render_frame, render_reference, render_stream
 from tuning.cases import SequenceCase
-from tuning.data_config import ExrStreamData, SceneStreamData
+from tuning.config.data import ExrStreamData, SceneStreamData
 from tuning.frame_cache import cache_key, cached, frame_of, planes_of
 from tuning.framing import cached_box, seen_through, view_of
 from tuning.numbering import numbered_file

@@ -14,7 +14,7 @@ from torchblur.frame import Shutter, ShutterPosition
 from torchblur.io import load_yaml
 from torchblur.params import Config, build
 from torchblur.presets import load_preset
-from tuning.overrides import apply_overrides
+from tuning.config.overrides import apply_overrides
 from tuning.rendering import find_scene
 
 __all__ = [

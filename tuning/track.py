@@ -26,7 +26,7 @@ from torchblur.filters import get_filter
 from torchblur.metrics import display_encode, flip_ldr
 from torchblur.params import choices
 from tuning.cases import AnyCase, SequenceCase
-from tuning.config import TuneConfig, resolve
+from tuning.config.fit import TuneConfig, resolve
 from tuning.data import load_cases
 from tuning.methods import method_name
 from tuning.preparation import fit_device

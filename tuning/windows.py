@@ -14,7 +14,7 @@ from torchblur.filters import BlurFilter
 from torchblur.filters.reach import ReachingBlur
 from torchblur.frame import Frame, Shutter
 from tuning.cases import AnyCase, Case
-from tuning.data_config import Crops
+from tuning.config.data import Crops
 from tuning.error_maps import error_map
 from tuning.mixture import window_weights
 

@@ -13,7 +13,7 @@ import tuning.cluster_problem
 from torchblur.params import build
 from tuning.cluster import ClusterError, open_cluster
 from tuning.cluster_problem import ClusterProblem
-from tuning.config import TuneConfig
+from tuning.config.fit import TuneConfig
 from tuning.fit import run_fit
 from tuning.preparation import prepare
 

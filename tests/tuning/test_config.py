@@ -9,8 +9,8 @@ from torchblur.errors import ConfigError, FileFormatError
 from torchblur.io import save_yaml
 from torchblur.params import build
 from torchblur.presets import Preset, save_preset
-from tuning.config import TuneConfig, load_tune_config, resolve
-from tuning.overrides import apply_overrides
+from tuning.config.fit import TuneConfig, load_tune_config, resolve
+from tuning.config.overrides import apply_overrides
 from tuning.space import make_space
 
 BASE = {

@@ -8,8 +8,8 @@ from torchblur.errors import ConfigError
 from torchblur.filters import BlurFilter, get_filter, registered_filters
 from torchblur.filters.base import FilterConfig
 from torchblur.params import declared
-from tuning.config import ObjectiveSpec
-from tuning.cost import Cost, cost_at, cost_of
+from tuning.config.cost import Cost, cost_at, cost_of
+from tuning.config.fit import ObjectiveSpec
 from tuning.problem import Problem
 from tuning.windows import make_samples
 

@@ -21,7 +21,7 @@ from torchblur.io import load_yaml, read_frame, read_image, save_yaml, write_fra
 from torchblur.metrics import border_band, evaluate
 from torchblur.params import build
 from tuning.commands import app
-from tuning.config import TuneConfig
+from tuning.config.fit import TuneConfig
 from tuning.crossfit import run_crossfit
 from tuning.crossfit_config import Bootstrap, load_crossfit_config
 from tuning.crossfit_files import write_crossfit

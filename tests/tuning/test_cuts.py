@@ -14,7 +14,7 @@ from torchblur.frame import Shutter
 from torchblur.params import build
 from torchblur.presets import load_preset
 from tuning.card import Card, card_text
-from tuning.config import TuneConfig, load_tune_config
+from tuning.config.fit import TuneConfig, load_tune_config
 from tuning.cuts import Cuts, cuts_over
 from tuning.evaluation import score_variant
 from tuning.fit import run_fit

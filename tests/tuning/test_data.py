@@ -15,8 +15,8 @@ from torchblur.filters import get_filter
 from torchblur.frame import Shutter
 from torchblur.io import write_frame, write_image
 from torchblur.params import build
+from tuning.config.data import Crops, DataSpec
 from tuning.data import cache_folder, load_cases
-from tuning.data_config import Crops, DataSpec
 from tuning.windows import make_samples
 
 SCENE = """

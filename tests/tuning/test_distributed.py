@@ -17,7 +17,7 @@ from planted import planted_case, write_planted
 from torchblur.io import save_yaml, write_frame, write_image
 from torchblur.presets import load_preset
 from tuning.cluster import Cluster, ClusterError
-from tuning.config import load_tune_config
+from tuning.config.fit import load_tune_config
 from tuning.distributed import Ranks, rank_here
 from tuning.distributed_problem import Shard
 from tuning.fit import run_fit

@@ -6,7 +6,7 @@ from planted import FIXED, planted_case
 from planted_sequences import sequence_case
 
 from torchblur.filters import get_filter
-from tuning.config import ObjectiveSpec
+from tuning.config.fit import ObjectiveSpec
 from tuning.distributed_problem import Shard, ShardedProblem
 from tuning.problem import Problem
 from tuning.windows import make_samples

@@ -12,7 +12,7 @@ from torchblur.filters import get_filter
 from torchblur.io import load_yaml, save_yaml
 from torchblur.ops import compiling
 from tuning.commands import app
-from tuning.config import TuneConfig, resolve
+from tuning.config.fit import TuneConfig, resolve
 from tuning.engine import files_engine, fit_engine
 from tuning.outputs import Job
 from tuning.space import make_space

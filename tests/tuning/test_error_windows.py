@@ -13,7 +13,7 @@ from torchblur.filters import get_filter
 from torchblur.frame import Frame, Shutter
 from torchblur.metrics import flip_ldr
 from torchblur.params import build
-from tuning.data_config import Crops
+from tuning.config.data import Crops
 from tuning.error_maps import error_map
 from tuning.windows import make_samples
 

@@ -15,7 +15,7 @@ from torchblur.params import build
 from torchblur.presets import create_filter, load_preset
 from tuning.blackbox import BlackBoxJob, fit_blackbox
 from tuning.blurring import blurred
-from tuning.config import BlackBoxMethod, FilterSpec, GradientMethod, TuneConfig
+from tuning.config.fit import BlackBoxMethod, FilterSpec, GradientMethod, TuneConfig
 from tuning.fit import run_fit
 from tuning.gradient import FitError, GradientJob, fit_gradient
 from tuning.result import FitResult

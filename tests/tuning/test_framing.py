@@ -12,8 +12,8 @@ from torchblur.io import read_frame, read_metadata
 from torchblur.params import build
 from torchblur.render import Scene, draw_scene, load_family, load_scene, render_frame
 from tuning.commands import app
+from tuning.config.data import DataSpec, FamilyData, SceneData
 from tuning.data import load_cases
-from tuning.data_config import DataSpec, FamilyData, SceneData
 from tuning.framing import busiest_box
 
 runner = CliRunner()

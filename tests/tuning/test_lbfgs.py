@@ -11,12 +11,12 @@ from planted import PLANTED
 
 from torchblur.errors import ConfigError
 from torchblur.params import build
-from tuning.config import FilterSpec, TuneConfig, resolve
+from tuning.config.fit import FilterSpec, TuneConfig, resolve
+from tuning.config.methods import GradientMethod
 from tuning.gradient import FitError, GradientJob, fit_gradient
 from tuning.gradient_state import losses_and_slopes
 from tuning.groups import FrameGroup
 from tuning.lbfgs import LbfgsState
-from tuning.method_config import GradientMethod
 from tuning.problem import Problem
 from tuning.runfolder import RunFolder
 from tuning.space import make_space

@@ -12,12 +12,12 @@ from torchblur.filters import get_filter
 from torchblur.io import save_yaml, write_frame, write_image
 from torchblur.params import build
 from torchblur.render import draw_scene, load_family
-from tuning.config import TuneConfig, resolve
+from tuning.config.data import DataSpec
+from tuning.config.fit import TuneConfig, resolve
+from tuning.config.objective import ObjectiveSpec
 from tuning.data import load_cases
-from tuning.data_config import DataSpec
 from tuning.fit import run_fit
 from tuning.mixture import window_weights
-from tuning.objective_config import ObjectiveSpec
 from tuning.problem import Problem
 from tuning.windows import make_samples
 

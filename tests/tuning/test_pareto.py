@@ -7,10 +7,10 @@ import pytest
 import torch
 from planted import FIXED, PLANTED
 
-from tuning.config import FilterSpec
-from tuning.cost import cost_of
+from tuning.config.cost import cost_of
+from tuning.config.fit import FilterSpec
+from tuning.config.methods import ParetoMethod, PolishSteps
 from tuning.gradient import FitError
-from tuning.method_config import ParetoMethod, PolishSteps
 from tuning.pareto import ParetoJob, fit_pareto
 from tuning.pareto_result import ParetoPoint, front_of, pick
 from tuning.runfolder import RunFolder

@@ -11,8 +11,8 @@ from torchblur.errors import ConfigError
 from torchblur.io import load_yaml, read_frame, save_yaml
 from torchblur.params import build
 from torchblur.presets import create_filter, load_preset
-from tuning.config import TuneConfig, load_tune_config
-from tuning.cost import cost_of
+from tuning.config.cost import cost_of
+from tuning.config.fit import TuneConfig, load_tune_config
 from tuning.fit import run_fit
 from tuning.result import FitResult
 
@@ -223,7 +223,7 @@ def test_mistakes_name_rule_value_and_place(tmp_path, monkeypatch, changes, mess
 @pytest.mark.parametrize("section", [{"methods": [{"kind": "pareto"}]}, {"objective": {"cost": 1}}])
 def test_a_filter_without_a_known_cost(tmp_path, monkeypatch, section):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("tuning.cost._TABLE", {})
+    monkeypatch.setattr("tuning.config.cost._TABLE", {})
     save_yaml("x.yaml", BASE | {"methods": [{"kind": "gradient", "free": ["kappa"]}]} | section)
     place = "methods.0.kind" if "methods" in section else "objective.cost"
     with pytest.raises(ConfigError, match=rf"cost of `guertin2014` is not known.*{place}"):

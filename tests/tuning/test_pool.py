@@ -12,12 +12,12 @@ import tuning.meter
 from torchblur.errors import ConfigError
 from torchblur.params import build
 from torchblur.render import draw_scene, load_family
-from tuning.config import TuneConfig, resolve
+from tuning.config.fit import TuneConfig, resolve
+from tuning.config.objective import ObjectiveSpec
 from tuning.distributed_problem import ShardedProblem
 from tuning.fit import run_fit
 from tuning.groups import FrameGroup, SequenceGroup, join
 from tuning.meter import Meter
-from tuning.objective_config import ObjectiveSpec
 from tuning.pool import Pool
 from tuning.preparation import prepare
 from tuning.race_config import load_race_config

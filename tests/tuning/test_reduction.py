@@ -5,8 +5,8 @@ import torch
 from planted import FIXED, PLANTED, planted_case
 
 from torchblur.filters import get_filter
-from tuning.config import ObjectiveSpec
-from tuning.data_config import Crops
+from tuning.config.data import Crops
+from tuning.config.fit import ObjectiveSpec
 from tuning.problem import Problem
 from tuning.reduction import tail_weights
 from tuning.windows import make_samples

@@ -14,7 +14,7 @@ from planted import planted_case, write_planted
 
 from torchblur.metrics import flip_ldr
 from torchblur.params import build
-from tuning.config import ObjectiveSpec, TuneConfig
+from tuning.config.fit import ObjectiveSpec, TuneConfig
 from tuning.evidence import evidence_of
 from tuning.fit import run_fit
 from tuning.page import Column, Row, Table, error_map, image_uri, make_view, map_limit, render_page

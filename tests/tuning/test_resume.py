@@ -15,14 +15,14 @@ from torchblur.errors import OutputError
 from torchblur.io import save_yaml
 from torchblur.params import build
 from tuning.blackbox import BlackBoxJob, fit_blackbox
-from tuning.config import BlackBoxMethod, FilterSpec, TuneConfig, load_tune_config
+from tuning.config.fit import BlackBoxMethod, FilterSpec, TuneConfig, load_tune_config
 from tuning.fit import run_fit
 from tuning.runfolder import RunFolder, open_run, trim_torn_line
 from tuning.space import make_space
 
 RUN = """
 import sys
-from tuning.config import load_tune_config
+from tuning.config.fit import load_tune_config
 from tuning.fit import run_fit
 run_fit(load_tune_config(sys.argv[1]), sys.argv[2], resume=True, progress=lambda e: print(
     e.stage, e.done, flush=True))

@@ -16,12 +16,12 @@ from torchblur.params import build
 from tuning.blackbox import BlackBoxJob, fit_blackbox
 from tuning.blackbox_study import Journal
 from tuning.candidates import evaluate_candidates
-from tuning.config import FilterSpec, TuneConfig, resolve
+from tuning.config.fit import FilterSpec, TuneConfig, resolve
+from tuning.config.methods import BlackBoxMethod, PruningSpec
+from tuning.config.objective import ObjectiveSpec
 from tuning.fidelity import Ladder, rung_sizes
 from tuning.fit import run_fit
 from tuning.groups import FrameGroup
-from tuning.method_config import BlackBoxMethod, PruningSpec
-from tuning.objective_config import ObjectiveSpec
 from tuning.polish import is_promising
 from tuning.problem import Problem
 from tuning.runfolder import RunFolder

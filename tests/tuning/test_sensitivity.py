@@ -6,7 +6,7 @@ import pytest
 import torch
 from planted import FIXED, PLANTED
 
-from tuning.config import FilterSpec
+from tuning.config.fit import FilterSpec
 from tuning.result import SensitivityResult
 from tuning.sensitivity import Differences, differences, gradient_slopes, measure_sensitivity
 from tuning.sensitivity_rows import _is_misled

@@ -17,8 +17,8 @@ from torchblur.metrics.pooling import weighted_median
 from torchblur.params import build
 from tuning.blackbox import BlackBoxJob, fit_blackbox
 from tuning.blurring import arguments, blurred_sequence
-from tuning.config import BlackBoxMethod, FilterSpec, GradientMethod, ObjectiveSpec, TuneConfig
-from tuning.data_config import Crops
+from tuning.config.data import Crops
+from tuning.config.fit import BlackBoxMethod, FilterSpec, GradientMethod, ObjectiveSpec, TuneConfig
 from tuning.evaluation import score_cases
 from tuning.fit import run_fit
 from tuning.gradient import FitError, GradientJob, fit_gradient

@@ -5,7 +5,7 @@ import shlex
 from pathlib import Path
 
 from torchblur.presets import load_preset
-from tuning.config import load_tune_config
+from tuning.config.fit import load_tune_config
 
 
 def _fitted(repository):

@@ -10,12 +10,12 @@ from planted_sequences import sequence_case
 from torchblur.filters import get_filter
 from torchblur.params import build
 from tuning.cluster_problem import ClusterProblem
-from tuning.config import ObjectiveSpec, TuneConfig, resolve
-from tuning.data_config import Crops
+from tuning.config.data import Crops
+from tuning.config.fit import ObjectiveSpec, TuneConfig, resolve
+from tuning.config.methods import PruningSpec
 from tuning.distributed_problem import Shard, ShardedProblem
 from tuning.fidelity import Ladder, rung_sizes
 from tuning.groups import FrameGroup
-from tuning.method_config import PruningSpec
 from tuning.preparation import prepare
 from tuning.problem import Problem
 from tuning.smaller import pixels_of, smaller

@@ -13,8 +13,8 @@ from torchblur.frame import Shutter
 from torchblur.io import write_frame, write_image
 from torchblur.params import build
 from tuning.cases import SequenceCase, check_needs
+from tuning.config.data import Crops, DataSpec
 from tuning.data import load_cases
-from tuning.data_config import Crops, DataSpec
 from tuning.streams import shot_starts
 from tuning.windows import make_samples
 

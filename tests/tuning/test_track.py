@@ -14,7 +14,7 @@ from torchblur.filters import get_filter
 from torchblur.io import save_yaml
 from torchblur.params import build
 from tuning.commands import app
-from tuning.config import TuneConfig
+from tuning.config.fit import TuneConfig
 from tuning.fit import run_fit
 from tuning.progress import ProgressEvent
 from tuning.track import Tracker, tracking

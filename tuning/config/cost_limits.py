@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING, Any
 from torchblur.errors import ConfigError
 from torchblur.filters import get_filter
 from torchblur.params import choices, declared
-from tuning.cost import cost_of
-from tuning.method_config import ParetoMethod
+from tuning.config.cost import cost_of
+from tuning.config.methods import ParetoMethod
 
 if TYPE_CHECKING:
-    from tuning.config import FilterSpec, FreeRange, TuneConfig
+    from tuning.config.fit import FilterSpec, FreeRange, TuneConfig
 
 __all__ = ["check_costs"]
 

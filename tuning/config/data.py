@@ -17,7 +17,7 @@ from pydantic import (
 
 from torchblur.frame import LONGEST_SHUTTER, Shutter, ShutterPosition
 from torchblur.params import Config
-from tuning.framing_config import Framed, read_size, refusal, without_none
+from tuning.config.framing import Framed, read_size, refusal, without_none
 
 __all__ = [
     "Crops",

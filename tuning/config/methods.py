@@ -9,7 +9,7 @@ from pydantic import Field
 
 from torchblur.errors import ConfigError, nearest_name
 from torchblur.params import Config, Param
-from tuning.data_config import DataItem, FamilyData, FamilyStreamData
+from tuning.config.data import DataItem, FamilyData, FamilyStreamData
 
 __all__ = [
     "BlackBoxMethod",

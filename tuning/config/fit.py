@@ -7,24 +7,29 @@ to the file too. `data` may be the path of a file that holds this section, for s
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from pydantic import Field, create_model, field_validator
 
-from torchblur.errors import ConfigError, nearest_name
+from torchblur.errors import ConfigError, FileFormatError, nearest_name
 from torchblur.filters import get_filter, registered_filters
 from torchblur.io import load_yaml
 from torchblur.ops.compiling import EngineChoice
 from torchblur.params import Config, build, choices, declared
 from torchblur.presets import load_preset
-from tuning.cost_checks import check_costs
-from tuning.data_config import DataSpec
-from tuning.method_config import BlackBoxMethod, GradientMethod, Method, check_method, check_refresh
-from tuning.objective_config import ObjectiveSpec
-from tuning.overrides import apply_overrides
-from tuning.shared_data import with_shared_data
+from tuning.config.cost_limits import check_costs
+from tuning.config.data import DataSpec
+from tuning.config.methods import (
+    BlackBoxMethod,
+    GradientMethod,
+    Method,
+    check_method,
+    check_refresh,
+)
+from tuning.config.objective import ObjectiveSpec
+from tuning.config.overrides import apply_overrides
 
 __all__ = [
     "BlackBoxMethod",
@@ -39,6 +44,7 @@ __all__ = [
     "load_tune_config",
     "resolve",
     "resolve_filter",
+    "with_shared_data",
 ]
 
 _SHUTTER_KEYS = ("shutter", "shutter_position")
@@ -277,3 +283,39 @@ def _check_narrowed(spec: FilterSpec, name: str, limits: FreeRange, where: str) 
 
 def _join(place: str, keys: str) -> str:
     return f"{place}: {keys}" if place else keys
+
+
+def with_shared_data(
+    content: Mapping[str, Any], path: Path, overrides: Sequence[str] = ()
+) -> dict[str, Any]:
+    """Return a configuration's content with overrides, and with `data` read from its file if any.
+
+    The file holds what would stand under `data`; its `root` is relative to itself. Overrides of
+    single values (``data.train.0.spp=8``) count for what was read; ``data=other.yaml`` takes
+    another file, relative to the working folder.
+
+    Args:
+        content: As the YAML file gives it; left as it is.
+        path: The configuration's file.
+        overrides: "key.path=value", value in YAML.
+
+    Raises:
+        ConfigError: no such file, or a mistake in it; with its name and the key.
+    """
+    whole = [text for text in overrides if text.startswith("data=")]
+    content = apply_overrides(content, whole)
+    if isinstance(content.get("data"), str):
+        folder = Path.cwd() if whole else path.parent
+        content = content | {"data": _read(folder / content["data"], f"{path}: data")}
+    return apply_overrides(content, [text for text in overrides if text not in whole])
+
+
+def _read(path: Path, where: str) -> dict[str, Any]:
+    try:
+        data = load_yaml(path)
+    except FileFormatError as error:
+        raise ConfigError(
+            f"`data` must be a mapping, or the path of a YAML file with one: {error} ({where})"
+        ) from error
+    spec = build(DataSpec, data, str(path))
+    return data | {"root": str((path.parent / spec.root).resolve())}
