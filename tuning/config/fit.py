@@ -44,7 +44,6 @@ __all__ = [
     "load_tune_config",
     "resolve",
     "resolve_filter",
-    "with_shared_data",
 ]
 
 _SHUTTER_KEYS = ("shutter", "shutter_position")
@@ -120,10 +119,35 @@ def load_tune_config(path: str | Path, overrides: Sequence[str] = ()) -> TuneCon
         FileFormatError: no such file.
     """
     path = Path(path)
-    content = with_shared_data(load_yaml(path), path, overrides)
+    content = _with_shared_data(load_yaml(path), path, overrides)
     config = build(TuneConfig, content, str(path))
     own_root = any(text.startswith("data.root=") for text in overrides)
     return resolve(config, str(path), path.parent, Path.cwd() if own_root else None)
+
+
+def _with_shared_data(
+    content: Mapping[str, Any], path: Path, overrides: Sequence[str] = ()
+) -> dict[str, Any]:
+    """Return a configuration's content with overrides, and with `data` read from its file if any.
+
+    The file holds what would stand under `data`; its `root` is relative to itself. Overrides of
+    single values (``data.train.0.spp=8``) count for what was read; ``data=other.yaml`` takes
+    another file, relative to the working folder.
+
+    Args:
+        content: As the YAML file gives it; left as it is.
+        path: The configuration's file.
+        overrides: "key.path=value", value in YAML.
+
+    Raises:
+        ConfigError: no such file, or a mistake in it; with its name and the key.
+    """
+    whole = [text for text in overrides if text.startswith("data=")]
+    content = apply_overrides(content, whole)
+    if isinstance(content.get("data"), str):
+        folder = Path.cwd() if whole else path.parent
+        content = content | {"data": _read_data(folder / content["data"], f"{path}: data")}
+    return apply_overrides(content, [text for text in overrides if text not in whole])
 
 
 def resolve(
@@ -205,6 +229,17 @@ def free_names(config: TuneConfig, index: int, place: str = "") -> tuple[str, ..
 # -- checks ----------------------------------------------------------------------------------------
 
 
+def _read_data(path: Path, where: str) -> dict[str, Any]:
+    try:
+        data = load_yaml(path)
+    except FileFormatError as error:
+        raise ConfigError(
+            f"`data` must be a mapping, or the path of a YAML file with one: {error} ({where})"
+        ) from error
+    spec = build(DataSpec, data, str(path))
+    return data | {"root": str((path.parent / spec.root).resolve())}
+
+
 def _without_preset(spec: FilterSpec, place: str, folder: Path) -> FilterSpec:
     if spec.kind in registered_filters():
         return spec
@@ -283,39 +318,3 @@ def _check_narrowed(spec: FilterSpec, name: str, limits: FreeRange, where: str) 
 
 def _join(place: str, keys: str) -> str:
     return f"{place}: {keys}" if place else keys
-
-
-def with_shared_data(
-    content: Mapping[str, Any], path: Path, overrides: Sequence[str] = ()
-) -> dict[str, Any]:
-    """Return a configuration's content with overrides, and with `data` read from its file if any.
-
-    The file holds what would stand under `data`; its `root` is relative to itself. Overrides of
-    single values (``data.train.0.spp=8``) count for what was read; ``data=other.yaml`` takes
-    another file, relative to the working folder.
-
-    Args:
-        content: As the YAML file gives it; left as it is.
-        path: The configuration's file.
-        overrides: "key.path=value", value in YAML.
-
-    Raises:
-        ConfigError: no such file, or a mistake in it; with its name and the key.
-    """
-    whole = [text for text in overrides if text.startswith("data=")]
-    content = apply_overrides(content, whole)
-    if isinstance(content.get("data"), str):
-        folder = Path.cwd() if whole else path.parent
-        content = content | {"data": _read(folder / content["data"], f"{path}: data")}
-    return apply_overrides(content, [text for text in overrides if text not in whole])
-
-
-def _read(path: Path, where: str) -> dict[str, Any]:
-    try:
-        data = load_yaml(path)
-    except FileFormatError as error:
-        raise ConfigError(
-            f"`data` must be a mapping, or the path of a YAML file with one: {error} ({where})"
-        ) from error
-    spec = build(DataSpec, data, str(path))
-    return data | {"root": str((path.parent / spec.root).resolve())}
