@@ -18,8 +18,8 @@ from torchblur.io import ConventionOverrides, get_convention, read_frame
 from torchblur.ops.compiling import EngineChoice
 from torchblur.params import Config
 from torchblur.presets import create_filter
-from tuning.images import write_color
-from tuning.outputs import Job, made_by, numbered
+from tuning.files.images import write_color
+from tuning.files.outputs import Job, made_by, numbered
 
 __all__ = [
     "FilterSettings",

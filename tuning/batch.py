@@ -26,7 +26,8 @@ from tuning.cluster import Cluster
 from tuning.cluster_batch import run_on_cluster
 from tuning.config.fit import apply_overrides
 from tuning.engine import files_engine
-from tuning.outputs import (
+from tuning.files.frame_numbers import shots_of
+from tuning.files.outputs import (
     Job,
     State,
     drop_results,
@@ -41,7 +42,6 @@ from tuning.outputs import (
 )
 from tuning.progress import Progress, Stage
 from tuning.runner import Runner, Task, cores
-from tuning.shots import shots_of
 
 __all__ = [
     "BatchConfig",

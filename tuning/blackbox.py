@@ -25,6 +25,7 @@ from tuning.blackbox_study import make_pruner, make_sampler, new_study, suggest
 from tuning.candidates import evaluate_candidates
 from tuning.config.methods import BlackBoxMethod
 from tuning.fidelity import Climb, Ladder
+from tuning.files.run_folder import RunFolder
 from tuning.gradient import FitError, seed_of
 from tuning.job import MethodJob
 from tuning.polish import Polished, PolishStart, is_promising, polish
@@ -32,7 +33,6 @@ from tuning.problem import Problem
 from tuning.progress import Progress
 from tuning.result import MethodResult
 from tuning.rounds import run_rounds
-from tuning.runfolder import RunFolder
 
 __all__ = ["BlackBoxJob", "fit_blackbox"]
 

@@ -25,7 +25,7 @@ from optuna.storages.journal import JournalFileBackend
 from optuna.trial import FrozenTrial, Trial
 
 from tuning.config.methods import BlackBoxMethod
-from tuning.runfolder import RunFolder, trim_torn_line
+from tuning.files.run_folder import RunFolder, trim_torn_line
 from tuning.space import FreeParameter
 
 __all__ = ["Journal", "make_pruner", "make_sampler", "new_study", "suggest"]

@@ -23,7 +23,7 @@ from torchblur.ops.compiling import compiler_works
 from torchblur.ops.gather import Engine
 from tuning.apply import FilterSettings, make_filter
 from tuning.cluster import Cluster, ClusterError, Lost, here, share_cores
-from tuning.outputs import Job
+from tuning.files.outputs import Job
 from tuning.runner import Log, Runner, Task
 
 __all__ = ["run_on_cluster"]

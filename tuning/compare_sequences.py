@@ -14,8 +14,8 @@ from torchblur.frame import Shutter
 from torchblur.io import read_frame
 from torchblur.metrics import border_band, prepare_flip_ldr
 from tuning.compare import Comparison, check_size, short_names
-from tuning.images import read_color
-from tuning.numbering import frame_numbers, numbered_file
+from tuning.files.frame_numbers import frame_numbers, numbered_file
+from tuning.files.images import read_color
 from tuning.result import FrameScore
 from tuning.sequence_plots import frame_curves
 from tuning.sequence_scores import FrameByFrame, finite_or_none

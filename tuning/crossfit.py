@@ -26,11 +26,11 @@ from tuning.config.fit import TuneConfig
 from tuning.crossfit_config import CrossfitConfig
 from tuning.crossfit_tiles import Sums, tile_sums
 from tuning.data import load_cases
+from tuning.files.outputs import make_folders
+from tuning.files.run_folder import open_run
 from tuning.methods import run_methods
-from tuning.outputs import make_folders
 from tuning.preparation import fit_device, prepare
 from tuning.progress import Progress, Stage
-from tuning.runfolder import open_run
 from tuning.study import slug, source_hash
 from tuning.variants import Variant, cut_of
 from tuning.worker_pool import worker_pool

@@ -16,7 +16,7 @@ from tuning.crossfit_config import CrossfitConfig
 from tuning.crossfit_plots import plot_crossfit
 from tuning.crossfit_summary import MEAN, Row, cut_texts, mean_names, summary_of, verdicts
 from tuning.crossfit_tiles import Figure
-from tuning.outputs import make_folders
+from tuning.files.outputs import make_folders
 
 __all__ = ["COLUMNS", "TARGETS", "UNSURE", "cell", "note_of", "write_crossfit"]
 

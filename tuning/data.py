@@ -28,9 +28,9 @@ from tuning.config.data import (
     SceneStreamData,
 )
 from tuning.drawing import drawn_scenes
+from tuning.files.frame_numbers import frame_numbers, numbered_file
 from tuning.frame_cache import cache_folder, cache_key, cached, frame_of, planes_of
 from tuning.framing import cached_box, seen_through, view_of
-from tuning.numbering import frame_numbers, numbered_file
 from tuning.streams import ExrStreamJob, SceneStreamJob
 
 __all__ = ["Case", "SequenceCase", "cache_folder", "draw_cases", "load_cases"]

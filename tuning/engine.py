@@ -16,7 +16,7 @@ from torchblur.ops.compiling import GRADIENT_CALLS
 from torchblur.ops.gather import Engine
 from tuning.config.fit import TuneConfig
 from tuning.config.methods import GradientMethod, Method, ParetoMethod
-from tuning.outputs import Job
+from tuning.files.outputs import Job
 from tuning.problem import Problem
 from tuning.smaller import pixels_of
 from tuning.space import Space

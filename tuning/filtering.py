@@ -25,11 +25,11 @@ from tuning.apply import (
 )
 from tuning.config.fit import apply_overrides
 from tuning.engine import files_engine
-from tuning.images import read_color
+from tuning.files.frame_numbers import shots_of
+from tuning.files.images import read_color
+from tuning.files.outputs import Job, find_inputs, make_folders, name_outputs, numbered
 from tuning.judging import Scores, SequenceJudge, asked_name, judge, mean_scores
-from tuning.outputs import Job, find_inputs, make_folders, name_outputs, numbered
 from tuning.progress import Progress, Stage
-from tuning.shots import shots_of
 
 __all__ = ["FileJob", "filter_files", "load_settings", "plan_files"]
 

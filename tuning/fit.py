@@ -23,6 +23,7 @@ from tuning.config.fit import GradientMethod, TuneConfig, resolve
 from tuning.distributed import is_restarted, join_ranks
 from tuning.evaluation import ceiling, score_cases, score_variant
 from tuning.evidence import evidence_of
+from tuning.files.run_folder import RunFolder, open_run
 from tuning.methods import run_methods
 from tuning.pareto_files import write_pareto
 from tuning.pareto_scores import budget_notes, judged
@@ -31,7 +32,6 @@ from tuning.problem import Problem
 from tuning.progress import Progress, ProgressEvent, Stage
 from tuning.report import write_report
 from tuning.result import CaseScore, FitResult, MethodResult, ParameterResult, SensitivityResult
-from tuning.runfolder import RunFolder, open_run
 from tuning.sensitivity import measure_sensitivity
 from tuning.space import Space
 from tuning.variants import Variant

@@ -12,6 +12,7 @@ import math
 import time
 from typing import Any
 
+from tuning.files.run_folder import RunFolder
 from tuning.gradient_state import (
     AdamState,
     FitError,
@@ -26,7 +27,6 @@ from tuning.pool import Pool
 from tuning.problem import Problem
 from tuning.progress import Progress, Stage
 from tuning.result import MethodResult, StartResult
-from tuning.runfolder import RunFolder
 
 __all__ = ["FitError", "GradientJob", "fit_gradient", "seed_of"]
 

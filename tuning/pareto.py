@@ -24,6 +24,7 @@ from tuning.blackbox_study import new_study, suggest
 from tuning.candidates import evaluate_candidates
 from tuning.config.cost import cost_at
 from tuning.config.methods import ParetoMethod
+from tuning.files.run_folder import RunFolder
 from tuning.gradient import FitError, seed_of
 from tuning.job import MethodJob
 from tuning.pareto_result import ParetoPoint, ParetoResult, front_of, make_point, pick
@@ -32,7 +33,6 @@ from tuning.problem import Problem
 from tuning.progress import Progress, Stage
 from tuning.result import MethodResult
 from tuning.rounds import run_rounds
-from tuning.runfolder import RunFolder
 from tuning.space import FreeParameter
 
 __all__ = ["ParetoJob", "fit_pareto"]

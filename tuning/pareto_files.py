@@ -12,10 +12,10 @@ from torchblur.presets import Preset, save_preset
 from tuning.cases import AnyCase
 from tuning.config.fit import TuneConfig
 from tuning.evidence import evidence_of
+from tuning.files.run_folder import RunFolder
 from tuning.pareto_plots import front_png
 from tuning.pareto_result import ParetoPick, ParetoPoint, ParetoResult
 from tuning.result import FitResult, MethodResult
-from tuning.runfolder import RunFolder
 
 __all__ = ["front_method", "write_pareto"]
 

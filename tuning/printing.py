@@ -28,7 +28,7 @@ from tuning.console import (
     print_warning,
     results,
 )
-from tuning.outputs import State
+from tuning.files.outputs import State
 from tuning.pareto_report import preset_names
 from tuning.reach_advice import SHUTTER, reach_advice
 from tuning.result import FitResult, cut_text, height_name

@@ -22,13 +22,13 @@ from torchblur.errors import ConfigError
 from tuning.cases import AnyCase, Case
 from tuning.config.fit import TuneConfig, resolve
 from tuning.config.methods import GradientMethod
+from tuning.files.run_folder import RunFolder, open_run
 from tuning.methods import run_methods
 from tuning.preparation import prepare
 from tuning.problem import Problem
 from tuning.progress import Progress, Stage
 from tuning.race_config import Entrant, RaceConfig, RaceProblem
 from tuning.result import MethodResult
-from tuning.runfolder import RunFolder, open_run
 from tuning.space import Space
 from tuning.study import slug
 from tuning.variants import Variant, render

@@ -11,7 +11,7 @@ from importlib.metadata import version
 from pathlib import Path
 
 from torchblur.io.paths import output_file
-from tuning.outputs import make_folders
+from tuning.files.outputs import make_folders
 from tuning.race import Curve
 from tuning.race_config import RaceConfig, RaceProblem
 from tuning.race_plots import plot_race

@@ -15,6 +15,7 @@ from torchblur.filters import get_filter
 from torchblur.params import Param
 from tuning.cases import AnyCase, SequenceCase
 from tuning.config.fit import TuneConfig
+from tuning.files.run_folder import RunFolder
 from tuning.page import Column, Row, Table, View, make_view, render_page
 from tuning.pareto_report import front_section, preset_names
 from tuning.plots import loss_curves, parameter_paths
@@ -27,7 +28,6 @@ from tuning.result import (
     height_name,
     worse_text,
 )
-from tuning.runfolder import RunFolder
 from tuning.sensitivity_rows import slope_rows
 from tuning.sequence_plots import score_curves
 from tuning.variants import Variant, render, render_frames

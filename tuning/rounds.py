@@ -9,9 +9,9 @@ import optuna
 from optuna.trial import FrozenTrial, TrialState
 
 from tuning.blackbox_study import Journal
+from tuning.files.run_folder import RunFolder
 from tuning.job import MethodJob
 from tuning.progress import Progress, Stage
-from tuning.runfolder import RunFolder
 
 __all__ = ["Search", "run_rounds"]
 

@@ -22,7 +22,7 @@ from torchblur.filters.base import History, TemporalBlur
 from torchblur.frame import Frame
 from torchblur.ops.compiling import compiler_works
 from tuning.apply import FilterSettings, blur_frame, blur_step, read_samples, write_job
-from tuning.outputs import Job
+from tuning.files.outputs import Job
 
 __all__ = ["Log", "Runner", "Task", "cores"]
 

@@ -19,9 +19,9 @@ from torchblur.metrics import border_band
 from torchblur.render import Scene, render_frame, render_reference, render_stream
 from tuning.cases import SequenceCase
 from tuning.config.data import ExrStreamData, SceneStreamData
+from tuning.files.frame_numbers import numbered_file
 from tuning.frame_cache import cache_key, cached, frame_of, planes_of
 from tuning.framing import cached_box, seen_through, view_of
-from tuning.numbering import numbered_file
 
 __all__ = ["ExrStreamJob", "SceneStreamJob", "shot_starts"]
 

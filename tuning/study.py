@@ -27,7 +27,7 @@ from torchblur.filters import BlurFilter, History, TemporalBlur
 from torchblur.frame import Frame
 from torchblur.io.paths import output_file
 from torchblur.metrics import FlipReference, border_band, prepare_flip_ldr
-from tuning.images import write_color
+from tuning.files.images import write_color
 from tuning.progress import Progress, Stage
 from tuning.study_config import StudyConfig, StudyExr, StudyScene, StudyVariant, make_filter
 from tuning.study_data import Moment, identity_of, moments

@@ -18,7 +18,7 @@ from tuning.batch import BatchConfig, plan_batch, run_batch
 from tuning.cluster import ClusterError, Lost, open_cluster
 from tuning.cluster_batch import _collect, _make, _Order, _Told
 from tuning.commands import app
-from tuning.outputs import Job
+from tuning.files.outputs import Job
 from tuning.runner import Task
 
 

@@ -14,7 +14,7 @@ from torchblur.ops import compiling
 from tuning.commands import app
 from tuning.config.fit import TuneConfig, resolve
 from tuning.engine import files_engine, fit_engine
-from tuning.outputs import Job
+from tuning.files.outputs import Job
 from tuning.space import make_space
 
 

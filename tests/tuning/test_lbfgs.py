@@ -13,12 +13,12 @@ from torchblur.errors import ConfigError
 from torchblur.params import build
 from tuning.config.fit import FilterSpec, TuneConfig, resolve
 from tuning.config.methods import GradientMethod
+from tuning.files.run_folder import RunFolder
 from tuning.gradient import FitError, GradientJob, fit_gradient
 from tuning.gradient_state import losses_and_slopes
 from tuning.groups import FrameGroup
 from tuning.lbfgs import LbfgsState
 from tuning.problem import Problem
-from tuning.runfolder import RunFolder
 from tuning.space import make_space
 
 TIMES = {"seconds", "cpu_seconds", "spent"}

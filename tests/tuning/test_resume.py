@@ -16,8 +16,8 @@ from torchblur.io import save_yaml
 from torchblur.params import build
 from tuning.blackbox import BlackBoxJob, fit_blackbox
 from tuning.config.fit import BlackBoxMethod, FilterSpec, TuneConfig, load_tune_config
+from tuning.files.run_folder import RunFolder, open_run, trim_torn_line
 from tuning.fit import run_fit
-from tuning.runfolder import RunFolder, open_run, trim_torn_line
 from tuning.space import make_space
 
 RUN = """

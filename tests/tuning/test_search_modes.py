@@ -20,11 +20,11 @@ from tuning.config.fit import FilterSpec, TuneConfig, resolve
 from tuning.config.methods import BlackBoxMethod, PruningSpec
 from tuning.config.objective import ObjectiveSpec
 from tuning.fidelity import Ladder, rung_sizes
+from tuning.files.run_folder import RunFolder
 from tuning.fit import run_fit
 from tuning.groups import FrameGroup
 from tuning.polish import is_promising
 from tuning.problem import Problem
-from tuning.runfolder import RunFolder
 from tuning.space import make_space
 from tuning.windows import make_samples
 

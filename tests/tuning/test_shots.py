@@ -21,9 +21,9 @@ from torchblur.io import read_frame, read_image, save_yaml, write_frame, write_i
 from torchblur.metrics import evaluate, temporal_errors
 from tuning.batch import BatchConfig, plan_batch, run_batch
 from tuning.commands import app
+from tuning.files.frame_numbers import shots_of
+from tuning.files.outputs import Job
 from tuning.filtering import filter_files, load_settings, plan_files
-from tuning.outputs import Job
-from tuning.shots import shots_of
 
 pytestmark = pytest.mark.usefixtures("recall")
 

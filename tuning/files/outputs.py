@@ -12,7 +12,7 @@ from typing import Any, Literal
 
 from torchblur.errors import ConfigError, FileFormatError, OutputError, nearest_name
 from torchblur.io import find_frames
-from tuning.images import IMAGE_TYPES, read_metadata
+from tuning.files.images import IMAGE_TYPES, read_metadata
 
 __all__ = [
     "Job",

@@ -1,14 +1,41 @@
-"""Files that belong to one shot: frames that a filter with a memory takes one after the other."""
+"""Frame numbers in the names of files: #### stands for the digits; and which files are one shot."""
 
 from __future__ import annotations
 
+import re
 from collections.abc import Collection, Iterable, Sequence
 from pathlib import Path
 from typing import Protocol, TypeVar
 
-from tuning.outputs import number_of
+from torchblur.errors import ConfigError
+from tuning.files.outputs import number_of
 
-__all__ = ["shots_of"]
+__all__ = ["frame_numbers", "numbered_file", "shots_of"]
+
+
+def frame_numbers(folder: Path, pattern: str, key: str) -> list[int]:
+    """Return the numbers of the files in a folder that fit a pattern, rising.
+
+    Args:
+        folder: Where they lie.
+        pattern: File name with # for digits.
+        key: Place in the configuration, for the message.
+
+    Raises:
+        ConfigError: if there is none.
+    """
+    name = re.sub(r"\\?#(\\?#)*", r"(\\d+)", re.escape(pattern))
+    found = [m for f in folder.iterdir() if (m := re.fullmatch(name, f.name))]
+    if not found:
+        raise ConfigError(f"no file in {folder} is called {pattern} ({key})")
+    return sorted(int(match[1]) for match in found)
+
+
+def numbered_file(pattern: str, number: int | None) -> str:
+    """Return a file name with its ####, if it has any, replaced by the number, padded."""
+    if number is None:
+        return pattern
+    return re.sub("#+", lambda match: str(number).zfill(len(match[0])), pattern)
 
 
 class _Sourced(Protocol):
