@@ -31,7 +31,7 @@ from tuning.job import MethodJob
 from tuning.polish import Polished, PolishStart, is_promising, polish
 from tuning.problem import Problem
 from tuning.progress import Progress
-from tuning.result import MethodResult
+from tuning.results.fit import MethodResult
 from tuning.rounds import run_rounds
 
 __all__ = ["BlackBoxJob", "fit_blackbox"]

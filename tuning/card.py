@@ -18,9 +18,9 @@ from tuning.config.fit import TuneConfig
 from tuning.page import Row, Table
 from tuning.pareto_files import front_method
 from tuning.pareto_report import front_section
-from tuning.pareto_result import ParetoResult
 from tuning.report import default_label, figures_tables
-from tuning.result import FitResult, ParameterResult, cut_text, worse_text
+from tuning.results.fit import FitResult, ParameterResult, cut_text, worse_text
+from tuning.results.front import ParetoResult
 
 __all__ = ["Card", "card_text"]
 

@@ -17,7 +17,7 @@ from tuning.config.fit import load_tune_config
 from tuning.data import load_cases
 from tuning.pareto_report import preset_names
 from tuning.progress import Progress, Stage
-from tuning.result import FitResult
+from tuning.results.fit import FitResult
 
 __all__ = ["write_cards"]
 

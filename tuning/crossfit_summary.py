@@ -11,7 +11,7 @@ import numpy as np
 from tuning.crossfit import Crossfit, Scored
 from tuning.crossfit_config import CrossfitConfig, Target
 from tuning.crossfit_tiles import Figure, draws_of, figures_of, summarize
-from tuning.cuts import cuts_over
+from tuning.results.cuts import cuts_over
 
 __all__ = [
     "MEAN",

@@ -26,7 +26,7 @@ from tuning.config.fit import TuneConfig
 from tuning.distributed_problem import Request, Shard, ShardedProblem
 from tuning.preparation import fingerprint, is_same_data, prepare
 from tuning.problem import Problem
-from tuning.result import FitResult
+from tuning.results.fit import FitResult
 
 __all__ = ["RankZeroStoppedError", "Ranks", "is_restarted", "join_ranks", "rank_here"]
 

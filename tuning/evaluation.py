@@ -15,7 +15,7 @@ from tuning.config.fit import GradientMethod, ObjectiveSpec
 from tuning.gradient import GradientJob, fit_gradient
 from tuning.problem import Problem
 from tuning.progress import Stage
-from tuning.result import CaseScore
+from tuning.results.fit import CaseScore
 from tuning.sequence_scores import finite_or_none, noisy_frames, score_frames
 from tuning.space import Space
 from tuning.variants import Variant, cut_of, render, render_frames

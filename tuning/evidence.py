@@ -7,7 +7,7 @@ from typing import Any
 
 from tuning.cases import AnyCase
 from tuning.config.objective import ObjectiveSpec
-from tuning.result import FitResult, height_name
+from tuning.results.fit import FitResult, height_name
 
 __all__ = ["evidence_of"]
 

@@ -31,7 +31,13 @@ from tuning.preparation import fit_device, prepare
 from tuning.problem import Problem
 from tuning.progress import Progress, ProgressEvent, Stage
 from tuning.report import write_report
-from tuning.result import CaseScore, FitResult, MethodResult, ParameterResult, SensitivityResult
+from tuning.results.fit import (
+    CaseScore,
+    FitResult,
+    MethodResult,
+    ParameterResult,
+    SensitivityResult,
+)
 from tuning.sensitivity import measure_sensitivity
 from tuning.space import Space
 from tuning.variants import Variant

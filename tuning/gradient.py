@@ -26,7 +26,7 @@ from tuning.lbfgs import LbfgsState
 from tuning.pool import Pool
 from tuning.problem import Problem
 from tuning.progress import Progress, Stage
-from tuning.result import MethodResult, StartResult
+from tuning.results.fit import MethodResult, StartResult
 
 __all__ = ["FitError", "GradientJob", "fit_gradient", "seed_of"]
 

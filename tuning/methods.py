@@ -15,7 +15,7 @@ from tuning.pareto import ParetoJob, fit_pareto
 from tuning.pool import Pool
 from tuning.problem import Problem
 from tuning.progress import Progress
-from tuning.result import MethodResult
+from tuning.results.fit import MethodResult
 from tuning.space import Space
 
 __all__ = ["method_name", "run_methods"]

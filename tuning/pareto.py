@@ -27,11 +27,11 @@ from tuning.config.methods import ParetoMethod
 from tuning.files.run_folder import RunFolder
 from tuning.gradient import FitError, seed_of
 from tuning.job import MethodJob
-from tuning.pareto_result import ParetoPoint, ParetoResult, front_of, make_point, pick
 from tuning.polish import Polished, PolishStart, polish
 from tuning.problem import Problem
 from tuning.progress import Progress, Stage
-from tuning.result import MethodResult
+from tuning.results.fit import MethodResult
+from tuning.results.front import ParetoPoint, ParetoResult, front_of, make_point, pick
 from tuning.rounds import run_rounds
 from tuning.space import FreeParameter
 

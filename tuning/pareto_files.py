@@ -14,8 +14,8 @@ from tuning.config.fit import TuneConfig
 from tuning.evidence import evidence_of
 from tuning.files.run_folder import RunFolder
 from tuning.pareto_plots import front_png
-from tuning.pareto_result import ParetoPick, ParetoPoint, ParetoResult
-from tuning.result import FitResult, MethodResult
+from tuning.results.fit import FitResult, MethodResult
+from tuning.results.front import ParetoPick, ParetoPoint, ParetoResult
 
 __all__ = ["front_method", "write_pareto"]
 

@@ -11,8 +11,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 
-from tuning.pareto_result import ParetoPoint, ParetoResult
 from tuning.plots import color_of, style, svg_of
+from tuning.results.front import ParetoPoint, ParetoResult
 
 __all__ = ["front_png", "front_svg"]
 

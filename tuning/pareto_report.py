@@ -10,8 +10,8 @@ from markupsafe import Markup
 from tuning.page import Column, Row, Table
 from tuning.pareto_files import front_method
 from tuning.pareto_plots import front_svg
-from tuning.pareto_result import ParetoPoint, ParetoResult
-from tuning.result import FitResult
+from tuning.results.fit import FitResult
+from tuning.results.front import ParetoPoint, ParetoResult
 
 __all__ = ["FrontSection", "front_section", "preset_names"]
 

@@ -8,10 +8,10 @@ from typing import Any
 from torchblur.filters import BlurFilter, get_filter
 from tuning.cases import AnyCase
 from tuning.config.cost import cost_at
-from tuning.pareto_result import Origin, ParetoPoint, make_point
 from tuning.problem import Problem
 from tuning.progress import Progress, Stage
-from tuning.result import MethodResult
+from tuning.results.fit import MethodResult
+from tuning.results.front import Origin, ParetoPoint, make_point
 from tuning.windows import make_samples
 
 __all__ = ["budget_notes", "judged"]

@@ -15,7 +15,7 @@ from matplotlib.axis import Axis
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 
-from tuning.result import FitResult, MethodResult, ParameterResult
+from tuning.results.fit import FitResult, MethodResult, ParameterResult
 
 __all__ = ["color_of", "loss_curves", "parameter_paths", "style", "svg_of"]
 

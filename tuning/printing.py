@@ -31,7 +31,7 @@ from tuning.console import (
 from tuning.files.outputs import State
 from tuning.pareto_report import preset_names
 from tuning.reach_advice import SHUTTER, reach_advice
-from tuning.result import FitResult, cut_text, height_name
+from tuning.results.fit import FitResult, cut_text, height_name
 
 __all__ = [
     "print_ablation",

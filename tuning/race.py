@@ -28,7 +28,7 @@ from tuning.preparation import prepare
 from tuning.problem import Problem
 from tuning.progress import Progress, Stage
 from tuning.race_config import Entrant, RaceConfig, RaceProblem
-from tuning.result import MethodResult
+from tuning.results.fit import MethodResult
 from tuning.space import Space
 from tuning.study import slug
 from tuning.variants import Variant, render

@@ -19,7 +19,7 @@ from tuning.files.run_folder import RunFolder
 from tuning.page import Column, Row, Table, View, make_view, render_page
 from tuning.pareto_report import front_section, preset_names
 from tuning.plots import loss_curves, parameter_paths
-from tuning.result import (
+from tuning.results.fit import (
     CaseScore,
     FitResult,
     MethodResult,

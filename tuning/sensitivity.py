@@ -18,7 +18,7 @@ from torch import Tensor
 
 from tuning.problem import Problem
 from tuning.progress import Progress, Stage
-from tuning.result import SensitivityResult
+from tuning.results.fit import SensitivityResult
 from tuning.space import Space
 
 __all__ = ["Differences", "differences", "gradient_slopes", "measure_sensitivity", "sensitivities"]

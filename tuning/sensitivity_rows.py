@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from tuning.result import FitResult, SensitivityResult
+from tuning.results.fit import FitResult, SensitivityResult
 
 __all__ = ["SlopeRow", "slope_rows"]
 

@@ -11,7 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from tuning.plots import color_of, style, svg_of
-from tuning.result import CaseScore, FrameScore
+from tuning.results.fit import CaseScore, FrameScore
 
 __all__ = ["frame_curves", "score_curves"]
 

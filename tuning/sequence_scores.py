@@ -11,7 +11,7 @@ from torch import Tensor
 from torchblur.metrics import FlipReference, evaluate, prepare_flip_ldr, temporal_error
 from torchblur.metrics.pooling import weighted_median
 from tuning.cases import SequenceCase
-from tuning.result import CaseScore, FrameScore
+from tuning.results.fit import CaseScore, FrameScore
 
 __all__ = [
     "FrameByFrame",

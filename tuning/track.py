@@ -31,7 +31,7 @@ from tuning.data import load_cases
 from tuning.methods import method_name
 from tuning.preparation import fit_device
 from tuning.progress import Progress, ProgressEvent
-from tuning.result import FitResult
+from tuning.results.fit import FitResult
 from tuning.variants import Variant, render, render_frames
 
 __all__ = ["Tracker", "tracking"]

@@ -21,7 +21,7 @@ from tuning.commands import app
 from tuning.config.fit import TuneConfig, load_tune_config
 from tuning.data import load_cases
 from tuning.fit import run_fit
-from tuning.result import CaseScore
+from tuning.results.fit import CaseScore
 
 FIGURES = {"flip": 0.02, "psnr": 30.0, "ssim": 0.9}
 LEVELS = {

@@ -18,7 +18,7 @@ from tuning.blurring import blurred
 from tuning.config.fit import BlackBoxMethod, FilterSpec, GradientMethod, TuneConfig
 from tuning.fit import run_fit
 from tuning.gradient import FitError, GradientJob, fit_gradient
-from tuning.result import FitResult
+from tuning.results.fit import FitResult
 from tuning.sensitivity import sensitivities
 from tuning.space import make_space
 

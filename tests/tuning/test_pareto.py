@@ -13,7 +13,7 @@ from tuning.config.methods import ParetoMethod, PolishSteps
 from tuning.files.run_folder import RunFolder
 from tuning.gradient import FitError
 from tuning.pareto import ParetoJob, fit_pareto
-from tuning.pareto_result import ParetoPoint, front_of, pick
+from tuning.results.front import ParetoPoint, front_of, pick
 from tuning.space import make_space
 
 TAPS = (3, 7, 11, 24)

@@ -14,7 +14,7 @@ from torchblur.presets import create_filter, load_preset
 from tuning.config.cost import cost_of
 from tuning.config.fit import TuneConfig, load_tune_config
 from tuning.fit import run_fit
-from tuning.result import FitResult
+from tuning.results.fit import FitResult
 
 SEARCH = {
     "kind": "pareto",

@@ -20,7 +20,7 @@ from tuning.fit import run_fit
 from tuning.page import Column, Row, Table, error_map, image_uri, make_view, map_limit, render_page
 from tuning.printing import print_fit
 from tuning.report import figures_table, figures_tables, verdict_of
-from tuning.result import CaseScore
+from tuning.results.fit import CaseScore
 
 
 @pytest.fixture(scope="module")

@@ -7,7 +7,7 @@ import torch
 from planted import FIXED, PLANTED
 
 from tuning.config.fit import FilterSpec
-from tuning.result import SensitivityResult
+from tuning.results.fit import SensitivityResult
 from tuning.sensitivity import Differences, differences, gradient_slopes, measure_sensitivity
 from tuning.sensitivity_rows import _is_misled
 from tuning.space import make_space

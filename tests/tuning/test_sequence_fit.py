@@ -23,7 +23,7 @@ from tuning.evaluation import score_cases
 from tuning.fit import run_fit
 from tuning.gradient import FitError, GradientJob, fit_gradient
 from tuning.problem import Problem
-from tuning.result import FitResult
+from tuning.results.fit import FitResult
 from tuning.space import make_space
 from tuning.variants import Variant
 from tuning.windows import make_samples

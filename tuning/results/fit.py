@@ -10,8 +10,8 @@ from pydantic import Field
 
 from torchblur.errors import ConfigError
 from torchblur.params import Config, build
-from tuning.cuts import Cuts, cuts_over
-from tuning.pareto_result import ParetoResult
+from tuning.results.cuts import Cuts, cuts_over
+from tuning.results.front import ParetoResult
 
 __all__ = [
     "CaseScore",
