@@ -21,14 +21,14 @@ from torchblur.filters import BlurFilter, get_filter
 from torchblur.frame import LONGEST_SHUTTER, ShutterPosition
 from torchblur.io import load_yaml
 from torchblur.params import Config, build
-from tuning.cases import Case
 from tuning.config.data import DataItem, DataSpec, ExrData, SceneData
 from tuning.config.overrides import apply_overrides
-from tuning.data import load_cases
+from tuning.data.cases import Case
+from tuning.data.loading import load_cases
+from tuning.data.variants import Variant, render
 from tuning.evaluation import noise_scores, score_image
 from tuning.progress import Progress, Stage
 from tuning.rendering import find_scene
-from tuning.variants import Variant, render
 
 __all__ = [
     "AblationConfig",

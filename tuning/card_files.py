@@ -12,9 +12,9 @@ from torchblur.io.paths import output_file
 from torchblur.presets import load_preset, save_preset
 from tuning.card import Card, card_text
 from tuning.card_picture import card_picture
-from tuning.cases import AnyCase
 from tuning.config.fit import load_tune_config
-from tuning.data import load_cases
+from tuning.data.cases import AnyCase
+from tuning.data.loading import load_cases
 from tuning.pareto_report import preset_names
 from tuning.progress import Progress, Stage
 from tuning.results.fit import FitResult

@@ -13,8 +13,8 @@ from torch import Tensor
 from torchblur.filters import get_filter
 from torchblur.metrics import display_encode, flip_ldr
 from tuning.card import Card
-from tuning.cases import AnyCase, Case
-from tuning.variants import Variant, render, render_frames
+from tuning.data.cases import AnyCase, Case
+from tuning.data.variants import Variant, render, render_frames
 
 __all__ = ["CardPicture", "card_picture"]
 

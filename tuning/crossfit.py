@@ -20,19 +20,19 @@ from torchblur.errors import ConfigError
 from torchblur.filters import get_filter
 from torchblur.io.paths import output_file
 from torchblur.params import build
-from tuning.cases import AnyCase, check_needs
 from tuning.config.data import DataItem, DataSpec
 from tuning.config.fit import TuneConfig
 from tuning.crossfit_config import CrossfitConfig
 from tuning.crossfit_tiles import Sums, tile_sums
-from tuning.data import load_cases
+from tuning.data.cases import AnyCase, check_needs
+from tuning.data.loading import load_cases
+from tuning.data.variants import Variant, cut_of
 from tuning.files.outputs import make_folders
 from tuning.files.run_folder import open_run
 from tuning.methods import run_methods
 from tuning.preparation import fit_device, prepare
 from tuning.progress import Progress, Stage
 from tuning.study import slug, source_hash
-from tuning.variants import Variant, cut_of
 from tuning.worker_pool import worker_pool
 
 __all__ = ["Crossfit", "Fold", "Scored", "run_crossfit"]

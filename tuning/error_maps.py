@@ -7,8 +7,8 @@ from torch import Tensor
 
 from torchblur.filters import BlurFilter, get_filter
 from torchblur.metrics import flip_ldr
-from tuning.blurring import arguments, blurred, blurred_sequence
-from tuning.cases import AnyCase, Case
+from tuning.data.blurring import arguments, blurred, blurred_sequence
+from tuning.data.cases import AnyCase, Case
 
 __all__ = ["error_map"]
 

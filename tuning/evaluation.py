@@ -10,15 +10,15 @@ from torch import Tensor
 
 from torchblur.filters import BlurFilter
 from torchblur.metrics import evaluate
-from tuning.cases import AnyCase, Case, SequenceCase
 from tuning.config.fit import GradientMethod, ObjectiveSpec
+from tuning.data.cases import AnyCase, Case, SequenceCase
+from tuning.data.variants import Variant, cut_of, render, render_frames
 from tuning.gradient import GradientJob, fit_gradient
 from tuning.problem import Problem
 from tuning.progress import Stage
 from tuning.results.fit import CaseScore
 from tuning.sequence_scores import finite_or_none, noisy_frames, score_frames
 from tuning.space import Space
-from tuning.variants import Variant, cut_of, render, render_frames
 from tuning.windows import make_samples
 
 __all__ = ["ceiling", "noise_scores", "score_cases", "score_image", "score_variant"]

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from tuning.cases import AnyCase
 from tuning.config.objective import ObjectiveSpec
+from tuning.data.cases import AnyCase
 from tuning.results.fit import FitResult, height_name
 
 __all__ = ["evidence_of"]

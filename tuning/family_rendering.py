@@ -7,7 +7,7 @@ from pathlib import Path
 from torchblur.errors import ConfigError, OutputError, TorchblurError
 from torchblur.io import load_yaml, save_yaml
 from torchblur.render import Scene, draw_scene, load_family, load_scene
-from tuning.drawing import drawn_name
+from tuning.data.families import drawn_name
 from tuning.progress import Progress
 from tuning.rendering import RenderSettings, render_sequence
 

@@ -16,10 +16,11 @@ from typing import Any
 
 from torchblur.filters import BlurFilter, get_filter
 from torchblur.presets import Preset, save_preset
-from tuning.cases import AnyCase, SequenceCase
 from tuning.cluster import Cluster, ClusterError
 from tuning.cluster_problem import ClusterProblem
 from tuning.config.fit import GradientMethod, TuneConfig, resolve
+from tuning.data.cases import AnyCase, SequenceCase
+from tuning.data.variants import Variant
 from tuning.distributed import is_restarted, join_ranks
 from tuning.evaluation import ceiling, score_cases, score_variant
 from tuning.evidence import evidence_of
@@ -40,7 +41,6 @@ from tuning.results.fit import (
 )
 from tuning.sensitivity import measure_sensitivity
 from tuning.space import Space
-from tuning.variants import Variant
 
 __all__ = ["run_fit"]
 

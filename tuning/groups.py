@@ -11,8 +11,8 @@ from torch import Tensor
 
 from torchblur.filters import BlurFilter
 from torchblur.frame import Frame
-from tuning.blurring import arguments, blurred, blurred_sequence
 from tuning.config.fit import ObjectiveSpec
+from tuning.data.blurring import arguments, blurred, blurred_sequence
 from tuning.meter import Meter
 from tuning.objective import PreparedObjective, prepare_objective
 from tuning.windows import AnySample, Sample, SequenceSample

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from tuning.cases import AnyCase
+from tuning.data.cases import AnyCase
 
 __all__ = ["window_weights"]
 

@@ -9,8 +9,8 @@ from typing import Any
 
 from torchblur.filters import get_filter
 from torchblur.presets import Preset, save_preset
-from tuning.cases import AnyCase
 from tuning.config.fit import TuneConfig
+from tuning.data.cases import AnyCase
 from tuning.evidence import evidence_of
 from tuning.files.run_folder import RunFolder
 from tuning.pareto_plots import front_png

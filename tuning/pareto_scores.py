@@ -6,8 +6,8 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from torchblur.filters import BlurFilter, get_filter
-from tuning.cases import AnyCase
 from tuning.config.cost import cost_at
+from tuning.data.cases import AnyCase
 from tuning.problem import Problem
 from tuning.progress import Progress, Stage
 from tuning.results.fit import MethodResult

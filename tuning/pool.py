@@ -19,10 +19,10 @@ import dataclasses
 from dataclasses import dataclass
 
 from torchblur.errors import ConfigError
-from tuning.cases import AnyCase
 from tuning.config.data import DataSpec, FamilyData, FamilyStreamData
 from tuning.config.methods import RefreshSpec
-from tuning.data import draw_cases
+from tuning.data.cases import AnyCase
+from tuning.data.loading import draw_cases
 from tuning.distributed_problem import ShardedProblem
 from tuning.gradient_state import seed_of
 from tuning.problem import Problem

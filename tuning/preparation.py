@@ -11,9 +11,9 @@ import torch
 
 from torchblur.errors import ConfigError
 from torchblur.filters import BlurFilter, get_filter
-from tuning.cases import AnyCase, check_needs
 from tuning.config.fit import TuneConfig
-from tuning.data import load_cases
+from tuning.data.cases import AnyCase, check_needs
+from tuning.data.loading import load_cases
 from tuning.engine import fit_engine
 from tuning.problem import Problem
 from tuning.space import Space, make_space

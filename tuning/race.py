@@ -19,9 +19,10 @@ from pathlib import Path
 from typing import Any
 
 from torchblur.errors import ConfigError
-from tuning.cases import AnyCase, Case
 from tuning.config.fit import TuneConfig, resolve
 from tuning.config.methods import GradientMethod
+from tuning.data.cases import AnyCase, Case
+from tuning.data.variants import Variant, render
 from tuning.files.run_folder import RunFolder, open_run
 from tuning.methods import run_methods
 from tuning.preparation import prepare
@@ -31,7 +32,6 @@ from tuning.race_config import Entrant, RaceConfig, RaceProblem
 from tuning.results.fit import MethodResult
 from tuning.space import Space
 from tuning.study import slug
-from tuning.variants import Variant, render
 from tuning.windows import make_samples
 
 __all__ = ["Curve", "Point", "grid", "run_race"]

@@ -17,8 +17,8 @@ from torchblur.io import write_frame, write_image
 from torchblur.params import build
 from torchblur.render import Renderer, Scene, load_scene
 from tuning.config.framing import Framed
+from tuning.data.framing import find_box, seen_through, view_of
 from tuning.files.outputs import made_by, make_folders, remove_leftovers, state_of
-from tuning.framing import find_box, seen_through, view_of
 from tuning.progress import Progress, Stage
 
 __all__ = ["RenderSettings", "find_scene", "render_sequence", "settings_of"]

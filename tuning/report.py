@@ -13,8 +13,9 @@ from markupsafe import Markup
 
 from torchblur.filters import get_filter
 from torchblur.params import Param
-from tuning.cases import AnyCase, SequenceCase
 from tuning.config.fit import TuneConfig
+from tuning.data.cases import AnyCase, SequenceCase
+from tuning.data.variants import Variant, render, render_frames
 from tuning.files.run_folder import RunFolder
 from tuning.page import Column, Row, Table, View, make_view, render_page
 from tuning.pareto_report import front_section, preset_names
@@ -30,7 +31,6 @@ from tuning.results.fit import (
 )
 from tuning.sensitivity_rows import slope_rows
 from tuning.sequence_plots import score_curves
-from tuning.variants import Variant, render, render_frames
 
 __all__ = [
     "Verdict",

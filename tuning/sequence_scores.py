@@ -10,7 +10,7 @@ from torch import Tensor
 
 from torchblur.metrics import FlipReference, evaluate, prepare_flip_ldr, temporal_error
 from torchblur.metrics.pooling import weighted_median
-from tuning.cases import SequenceCase
+from tuning.data.cases import SequenceCase
 from tuning.results.fit import CaseScore, FrameScore
 
 __all__ = [

@@ -10,7 +10,8 @@ import torch
 from torch import Tensor
 
 from torchblur.frame import Frame
-from tuning.windows import MOVING, AnySample, Sample
+from tuning.data.framing import MOVING
+from tuning.windows import AnySample, Sample
 
 __all__ = ["pixels_of", "smaller"]
 

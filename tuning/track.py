@@ -25,14 +25,14 @@ from torchblur.errors import ConfigError, OutputError
 from torchblur.filters import get_filter
 from torchblur.metrics import display_encode, flip_ldr
 from torchblur.params import choices
-from tuning.cases import AnyCase, SequenceCase
 from tuning.config.fit import TuneConfig, resolve
-from tuning.data import load_cases
+from tuning.data.cases import AnyCase, SequenceCase
+from tuning.data.loading import load_cases
+from tuning.data.variants import Variant, render, render_frames
 from tuning.methods import method_name
 from tuning.preparation import fit_device
 from tuning.progress import Progress, ProgressEvent
 from tuning.results.fit import FitResult
-from tuning.variants import Variant, render, render_frames
 
 __all__ = ["Tracker", "tracking"]
 

@@ -13,15 +13,13 @@ from torch import Tensor
 from torchblur.filters import BlurFilter
 from torchblur.filters.reach import ReachingBlur
 from torchblur.frame import Frame, Shutter
-from tuning.cases import AnyCase, Case
 from tuning.config.data import Crops
+from tuning.data.cases import AnyCase, Case
+from tuning.data.framing import MOVING
 from tuning.error_maps import error_map
 from tuning.mixture import window_weights
 
-__all__ = ["MOVING", "AnySample", "Sample", "SequenceSample", "make_samples"]
-
-MOVING = 0.5
-"""Least motion over the open shutter that counts, px; less is not seen as blur."""
+__all__ = ["AnySample", "Sample", "SequenceSample", "make_samples"]
 
 _CANDIDATE_STEPS = 8  # windows are placed on a grid of 1/8 of their size
 

@@ -8,7 +8,7 @@ import torch
 from tiny_shots import box_blur, moving_square
 from typer.testing import CliRunner
 
-import tuning.data
+import tuning.data.loading
 from torchblur.errors import ConfigError, OutputError
 from torchblur.filters import get_filter
 from torchblur.io import write_frame, write_image
@@ -85,13 +85,13 @@ class TestRun:
     def test_scene_is_rendered_once(self, table, monkeypatch):
         monkeypatch.setenv("TORCHBLUR_CACHE", str(table.parent / "cache"))
         calls = []
-        original = tuning.data.render_reference
+        original = tuning.data.loading.render_reference
 
         def counted(*args, **kwargs):
             calls.append(args)
             return original(*args, **kwargs)
 
-        monkeypatch.setattr(tuning.data, "render_reference", counted)
+        monkeypatch.setattr(tuning.data.loading, "render_reference", counted)
         first, second = run_ablation(load_ablation_config(table, ["time_runs=0"]))
         assert len(calls) == 1
         assert first.case is second.case

@@ -19,7 +19,7 @@ from tuning.card_files import write_cards
 from tuning.card_picture import card_picture
 from tuning.commands import app
 from tuning.config.fit import TuneConfig, load_tune_config
-from tuning.data import load_cases
+from tuning.data.loading import load_cases
 from tuning.fit import run_fit
 from tuning.results.fit import CaseScore
 

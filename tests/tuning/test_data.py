@@ -9,14 +9,14 @@ import torch
 import trimesh
 from planted import planted_case, tiny_frame
 
-import tuning.data
+import tuning.data.loading
 from torchblur.errors import ConfigError, FileFormatError
 from torchblur.filters import get_filter
 from torchblur.frame import Shutter
 from torchblur.io import write_frame, write_image
 from torchblur.params import build
 from tuning.config.data import Crops, DataSpec
-from tuning.data import cache_folder, load_cases
+from tuning.data.loading import cache_folder, load_cases
 from tuning.windows import make_samples
 
 SCENE = """
@@ -61,7 +61,7 @@ class TestScenes:
         def fail(*args, **kwargs):
             raise AssertionError("rendered again")
 
-        monkeypatch.setattr(tuning.data, "render_reference", fail)
+        monkeypatch.setattr(tuning.data.loading, "render_reference", fail)
         second = load_cases(spec_of(tmp_path, train=[item]))[0]
         assert torch.equal(first.reference, second.reference)
         assert torch.equal(first.frame.velocity, second.frame.velocity)
@@ -87,7 +87,7 @@ class TestScenes:
         def fail(*args, **kwargs):
             raise AssertionError("rendered again")
 
-        monkeypatch.setattr(tuning.data, "render_reference", fail)
+        monkeypatch.setattr(tuning.data.loading, "render_reference", fail)
         load_cases(spec_of(tmp_path, train=[item]))
         trimesh.creation.icosphere(subdivisions=2).export(mesh)
         with pytest.raises(AssertionError, match="rendered again"):

@@ -8,7 +8,7 @@ from torchblur.params import build
 from torchblur.render import draw_scene, load_family, load_scene, render_frame, render_reference
 from tuning.commands import app
 from tuning.config.data import DataSpec
-from tuning.data import load_cases
+from tuning.data.loading import load_cases
 
 runner = CliRunner()
 FAMILY = """

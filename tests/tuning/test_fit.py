@@ -14,8 +14,8 @@ from torchblur.metrics import psnr
 from torchblur.params import build
 from torchblur.presets import create_filter, load_preset
 from tuning.blackbox import BlackBoxJob, fit_blackbox
-from tuning.blurring import blurred
 from tuning.config.fit import BlackBoxMethod, FilterSpec, GradientMethod, TuneConfig
+from tuning.data.blurring import blurred
 from tuning.fit import run_fit
 from tuning.gradient import FitError, GradientJob, fit_gradient
 from tuning.results.fit import FitResult

@@ -2,7 +2,7 @@
 
 import torch
 
-from tuning import frame_cache
+from tuning.data import cache
 
 
 def test_two_machines_do_not_write_one_file(monkeypatch):
@@ -13,14 +13,14 @@ def test_two_machines_do_not_write_one_file(monkeypatch):
     def saving(tensors, path):
         written.append(path)
         if len(written) == 1:  # the other one comes just now
-            frame_cache.cached("same", lambda: {"x": torch.ones(3)})
+            cache.cached("same", lambda: {"x": torch.ones(3)})
         save(tensors, path)
 
     monkeypatch.setattr(torch, "save", saving)
-    frame_cache.cached("same", lambda: {"x": torch.ones(3)})
+    cache.cached("same", lambda: {"x": torch.ones(3)})
     assert len(set(written)) == 2
-    assert {path.parent for path in written} == {frame_cache.cache_folder() / "frames"}
+    assert {path.parent for path in written} == {cache.cache_folder() / "frames"}
     left = sorted(path.name for path in written[0].parent.glob("*same*"))
     assert left == ["same.pt"]
-    found = frame_cache.cached("same", lambda: {"x": torch.zeros(3)})
+    found = cache.cached("same", lambda: {"x": torch.zeros(3)})
     assert found["x"].tolist() == [1, 1, 1]

@@ -4,8 +4,8 @@ import pytest
 import torch
 from typer.testing import CliRunner
 
-import tuning.data
-import tuning.framing
+import tuning.data.framing
+import tuning.data.loading
 from torchblur.errors import ConfigError
 from torchblur.frame import Shutter
 from torchblur.io import read_frame, read_metadata
@@ -13,8 +13,8 @@ from torchblur.params import build
 from torchblur.render import Scene, draw_scene, load_family, load_scene, render_frame
 from tuning.commands import app
 from tuning.config.data import DataSpec, FamilyData, SceneData
-from tuning.data import load_cases
-from tuning.framing import busiest_box
+from tuning.data.framing import busiest_box
+from tuning.data.loading import load_cases
 
 runner = CliRunner()
 SCENE = """
@@ -121,8 +121,8 @@ class TestData:
             raise AssertionError("rendered again")
 
         with monkeypatch.context() as patched:
-            patched.setattr(tuning.data, "render_reference", fail)
-            patched.setattr(tuning.framing, "busiest_box", fail)
+            patched.setattr(tuning.data.loading, "render_reference", fail)
+            patched.setattr(tuning.data.framing, "busiest_box", fail)
             (second,) = load(tmp_path, item)
             assert torch.equal(first.reference, second.reference)
             with pytest.raises(AssertionError, match="rendered again"):

@@ -6,7 +6,7 @@ import pytest
 import torch
 from planted import FIXED, PLANTED, planted_case, tiny_frame, write_planted
 
-import tuning.data
+import tuning.data.loading
 from torchblur.errors import ConfigError
 from torchblur.filters import get_filter
 from torchblur.io import save_yaml, write_frame, write_image
@@ -15,7 +15,7 @@ from torchblur.render import draw_scene, load_family
 from tuning.config.data import DataSpec
 from tuning.config.fit import TuneConfig, resolve
 from tuning.config.objective import ObjectiveSpec
-from tuning.data import load_cases
+from tuning.data.loading import load_cases
 from tuning.fit import run_fit
 from tuning.mixture import window_weights
 from tuning.problem import Problem
@@ -73,7 +73,7 @@ class TestFamilies:
         def fail(*args, **kwargs):
             raise AssertionError("rendered again")
 
-        monkeypatch.setattr(tuning.data, "render_reference", fail)
+        monkeypatch.setattr(tuning.data.loading, "render_reference", fail)
         again = load_cases(spec_of(root, train=[family(seed=4, weight=2.0)]))
         assert [case.name for case in again] == ["family-0004 0", "family-0005 0"]
         # It is the drawn scenes that count, not the file.

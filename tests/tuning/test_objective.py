@@ -9,9 +9,9 @@ from planted import FIXED, PLANTED, planted_case, tiny_frame
 
 from torchblur.filters import get_filter
 from torchblur.metrics import flip_hdr, flip_ldr, ssim
-from tuning.blurring import blurred
 from tuning.config.data import Crops
 from tuning.config.fit import ObjectiveSpec
+from tuning.data.blurring import blurred
 from tuning.objective import prepare_objective
 from tuning.problem import Problem
 from tuning.windows import make_samples

@@ -84,14 +84,14 @@ class TestPool:
 
     def test_new_references_have_the_samples_that_are_asked_for(self, monkeypatch):
         asked = []
-        render = __import__("tuning.data", fromlist=["render_reference"]).render_reference
+        render = __import__("tuning.data.loading", fromlist=["render_reference"]).render_reference
 
         def seen(*args, spp, **more):
             asked.append(spp)
             return render(*args, spp=spp, **more)
 
         _, pool = pool_of(config_of(refresh=REFRESH | {"spp": 3}), seed=77)
-        monkeypatch.setattr("tuning.data.render_reference", seen)
+        monkeypatch.setattr("tuning.data.loading.render_reference", seen)
         pool.at(2)
         assert asked == [3, 3]
         pool.at(2)

@@ -16,16 +16,16 @@ from torchblur.metrics import flip_ldr, temporal_errors
 from torchblur.metrics.pooling import weighted_median
 from torchblur.params import build
 from tuning.blackbox import BlackBoxJob, fit_blackbox
-from tuning.blurring import arguments, blurred_sequence
 from tuning.config.data import Crops
 from tuning.config.fit import BlackBoxMethod, FilterSpec, GradientMethod, ObjectiveSpec, TuneConfig
+from tuning.data.blurring import arguments, blurred_sequence
+from tuning.data.variants import Variant
 from tuning.evaluation import score_cases
 from tuning.fit import run_fit
 from tuning.gradient import FitError, GradientJob, fit_gradient
 from tuning.problem import Problem
 from tuning.results.fit import FitResult
 from tuning.space import make_space
-from tuning.variants import Variant
 from tuning.windows import make_samples
 
 LINEAR = {"terms": {"mse": 1.0}, "color_space": "linear"}

@@ -6,16 +6,16 @@ import pytest
 import torch
 from planted_sequences import Recall, moving_sequence, sequence_case
 
-import tuning.streams
+import tuning.data.streams
 from torchblur.errors import ConfigError, FileFormatError
 from torchblur.filters import get_filter
 from torchblur.frame import Shutter
 from torchblur.io import write_frame, write_image
 from torchblur.params import build
-from tuning.cases import SequenceCase, check_needs
 from tuning.config.data import Crops, DataSpec
-from tuning.data import load_cases
-from tuning.streams import shot_starts
+from tuning.data.cases import SequenceCase, check_needs
+from tuning.data.loading import load_cases
+from tuning.data.streams import shot_starts
 from tuning.windows import make_samples
 
 SCENE = """
@@ -65,13 +65,13 @@ class TestSceneStreams:
     def test_rendered_once_and_frame_by_frame(self, tmp_path, item, monkeypatch):
         first = load(tmp_path, item)
         drawn = []
-        render = tuning.streams.render_stream
+        render = tuning.data.streams.render_stream
 
         def watched(*args, frame, **kwargs):
             drawn.append(frame)
             return render(*args, frame=frame, **kwargs)
 
-        monkeypatch.setattr(tuning.streams, "render_stream", watched)
+        monkeypatch.setattr(tuning.data.streams, "render_stream", watched)
         again = load(tmp_path, item | {"frames": [1, 2, 3], "warm_up": 1, "cuts": [2]})
         assert drawn == [3.0]
         assert torch.equal(again.samples[0][0].color, first.samples[0][1].color)

@@ -17,11 +17,11 @@ from torchblur.frame import Frame, Sequence
 from torchblur.io import read_frame, read_image
 from torchblur.metrics import border_band
 from torchblur.render import Scene, render_frame, render_reference, render_stream
-from tuning.cases import SequenceCase
 from tuning.config.data import ExrStreamData, SceneStreamData
+from tuning.data.cache import cache_key, cached, frame_of, planes_of
+from tuning.data.cases import SequenceCase
+from tuning.data.framing import cached_box, seen_through, view_of
 from tuning.files.frame_numbers import numbered_file
-from tuning.frame_cache import cache_key, cached, frame_of, planes_of
-from tuning.framing import cached_box, seen_through, view_of
 
 __all__ = ["ExrStreamJob", "SceneStreamJob", "shot_starts"]
 

@@ -11,8 +11,8 @@ from torch import Tensor
 
 from torchblur.filters import BlurFilter
 from torchblur.filters.reach import Cut, ReachingBlur
-from tuning.blurring import arguments, blurred, blurred_sequence
-from tuning.cases import AnyCase, Case, SequenceCase
+from tuning.data.blurring import arguments, blurred, blurred_sequence
+from tuning.data.cases import AnyCase, Case, SequenceCase
 
 __all__ = ["Variant", "cut_of", "render", "render_frames"]
 

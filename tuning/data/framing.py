@@ -14,13 +14,15 @@ from torchblur.frame import Shutter
 from torchblur.metrics import border_band
 from torchblur.render import Renderer, Scene
 from tuning.config.framing import Framed
-from tuning.frame_cache import cache_key, cached
-from tuning.windows import MOVING
+from tuning.data.cache import cache_key, cached
 
-__all__ = ["Box", "busiest_box", "cached_box", "find_box", "seen_through", "view_of"]
+__all__ = ["MOVING", "Box", "busiest_box", "cached_box", "find_box", "seen_through", "view_of"]
 
 Box: TypeAlias = tuple[int, int, int, int]
 """Top, left, height and width of a window, px of the whole image."""
+
+MOVING = 0.5
+"""Least motion over the open shutter that counts, px; less is not seen as blur."""
 
 _MAP = 128  # px of the map's longer edge
 _STEPS = 8  # the map is searched at this many steps along each axis

@@ -16,7 +16,6 @@ from torchblur.frame import Frame
 from torchblur.io import read_frame, read_image
 from torchblur.metrics import border_band
 from torchblur.render import Scene, load_scene, render_frame, render_reference
-from tuning.cases import AnyCase, Case, SequenceCase, refuse_repeats, with_unique_names
 from tuning.config.data import (
     DataItem,
     DataSpec,
@@ -27,11 +26,12 @@ from tuning.config.data import (
     SceneData,
     SceneStreamData,
 )
-from tuning.drawing import drawn_scenes
+from tuning.data.cache import cache_folder, cache_key, cached, frame_of, planes_of
+from tuning.data.cases import AnyCase, Case, SequenceCase, refuse_repeats, with_unique_names
+from tuning.data.families import drawn_scenes
+from tuning.data.framing import cached_box, seen_through, view_of
+from tuning.data.streams import ExrStreamJob, SceneStreamJob
 from tuning.files.frame_numbers import frame_numbers, numbered_file
-from tuning.frame_cache import cache_folder, cache_key, cached, frame_of, planes_of
-from tuning.framing import cached_box, seen_through, view_of
-from tuning.streams import ExrStreamJob, SceneStreamJob
 
 __all__ = ["Case", "SequenceCase", "cache_folder", "draw_cases", "load_cases"]
 
