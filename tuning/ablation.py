@@ -28,7 +28,7 @@ from tuning.data.loading import load_cases
 from tuning.data.variants import Variant, render
 from tuning.evaluation import noise_scores, score_image
 from tuning.progress import Progress, Stage
-from tuning.rendering import find_scene
+from tuning.render.scene import find_scene
 
 __all__ = [
     "AblationConfig",

@@ -16,7 +16,7 @@ from torchblur.metrics import FlipReference, prepare_flip_ldr
 from torchblur.render import Renderer, load_scene
 from tuning.bench_cases import Case
 from tuning.bench_work import bench_frame, make_filter
-from tuning.rendering import find_scene
+from tuning.render.scene import find_scene
 
 __all__ = ["METRIC_PARTS", "RENDER_SCENE", "STEP_PARTS", "Step", "median_parts", "render_parts"]
 

@@ -28,7 +28,7 @@ from tuning.config.fit import FilterSpec, FreeRange, TuneConfig, resolve, resolv
 from tuning.config.methods import Method
 from tuning.config.objective import ObjectiveSpec
 from tuning.config.overrides import apply_overrides
-from tuning.rendering import find_scene
+from tuning.render.scene import find_scene
 
 __all__ = [
     "Bootstrap",

@@ -114,7 +114,7 @@ def _write_program(
     from torchblur.export import constants_text, export_program, save_program
     from torchblur.filters import get_filter
     from torchblur.frame import Frame
-    from tuning.rendering import settings_of
+    from tuning.render.scene import settings_of
 
     if output.exists() and not overwrite:  # before the minute that the graph takes
         raise OutputError(f"{output} exists; overwrite=True (--overwrite) replaces it")

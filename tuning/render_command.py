@@ -74,8 +74,8 @@ def render(  # noqa: PLR0913 - each argument is an option
     pixel of a stream are files of their own: stream01.####.exr, stream02.####.exr … Each scene of
     a family goes to a folder of its own, with the scene as YAML.
     """
-    from tuning.family_rendering import render_file
-    from tuning.rendering import find_scene, settings_of
+    from tuning.render.family import render_file
+    from tuning.render.scene import find_scene, settings_of
 
     settings = settings_of(
         size,

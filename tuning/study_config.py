@@ -15,7 +15,7 @@ from torchblur.io import load_yaml
 from torchblur.params import Config, build
 from torchblur.presets import load_preset
 from tuning.config.overrides import apply_overrides
-from tuning.rendering import find_scene
+from tuning.render.scene import find_scene
 
 __all__ = [
     "KEPT_SAMPLES",

@@ -364,13 +364,13 @@ class TestRender:
         assert (tmp_path / f"deep/new/{scene.stem}.0000.exr").exists()
 
     def test_ctrl_c_keeps_what_is_done(self, scene, tmp_path, monkeypatch):
-        import tuning.rendering
+        import tuning.render.scene
 
         def interrupted(*args, **kwargs):
             raise KeyboardInterrupt
 
         with monkeypatch.context() as patch:
-            patch.setattr(tuning.rendering.Renderer, "reference", interrupted)
+            patch.setattr(tuning.render.scene.Renderer, "reference", interrupted)
             result = run("render", scene, "-o", tmp_path, "--size", "64x48", code=130)
         assert "the same command goes on" in result.stderr
         assert [path.name for path in tmp_path.iterdir()] == [f"{scene.stem}.0000.exr"]

@@ -9,7 +9,7 @@ from torchblur.io import load_yaml, save_yaml
 from torchblur.render import Scene, draw_scene, load_family, load_scene
 from tuning.data.families import drawn_name
 from tuning.progress import Progress
-from tuning.rendering import RenderSettings, render_sequence
+from tuning.render.scene import RenderSettings, render_sequence
 
 __all__ = ["is_family", "render_family", "render_file"]
 
