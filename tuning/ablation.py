@@ -26,9 +26,9 @@ from tuning.config.overrides import apply_overrides
 from tuning.data.cases import Case
 from tuning.data.loading import load_cases
 from tuning.data.variants import Variant, render
-from tuning.evaluation import noise_scores, score_image
 from tuning.progress import Progress, Stage
 from tuning.render.scene import find_scene
+from tuning.scoring.cases import noise_scores, score_image
 
 __all__ = [
     "AblationConfig",

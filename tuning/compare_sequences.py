@@ -18,8 +18,8 @@ from tuning.data.streams import shot_starts
 from tuning.files.frame_numbers import frame_numbers, numbered_file
 from tuning.files.images import read_color
 from tuning.results.fit import FrameScore
+from tuning.scoring.sequences import FrameByFrame, finite_or_none
 from tuning.sequence_plots import frame_curves
-from tuning.sequence_scores import FrameByFrame, finite_or_none
 
 __all__ = ["compare_sequences", "is_sequence"]
 

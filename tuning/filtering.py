@@ -28,8 +28,8 @@ from tuning.engine import files_engine
 from tuning.files.frame_numbers import shots_of
 from tuning.files.images import read_color
 from tuning.files.outputs import Job, find_inputs, make_folders, name_outputs, numbered
-from tuning.judging import Scores, SequenceJudge, asked_name, judge, mean_scores
 from tuning.progress import Progress, Stage
+from tuning.scoring.baselines import Scores, SequenceJudge, asked_name, judge, mean_scores
 
 __all__ = ["FileJob", "filter_files", "load_settings", "plan_files"]
 

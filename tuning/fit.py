@@ -16,13 +16,13 @@ from typing import Any
 
 from torchblur.filters import BlurFilter, get_filter
 from torchblur.presets import Preset, save_preset
+from tuning.ceiling import ceiling
 from tuning.cluster import Cluster, ClusterError
 from tuning.cluster_problem import ClusterProblem
 from tuning.config.fit import GradientMethod, TuneConfig, resolve
 from tuning.data.cases import AnyCase, SequenceCase
 from tuning.data.variants import Variant
 from tuning.distributed import is_restarted, join_ranks
-from tuning.evaluation import ceiling, score_cases, score_variant
 from tuning.evidence import evidence_of
 from tuning.files.run_folder import RunFolder, open_run
 from tuning.methods import run_methods
@@ -39,6 +39,7 @@ from tuning.results.fit import (
     ParameterResult,
     SensitivityResult,
 )
+from tuning.scoring.cases import score_cases, score_variant
 from tuning.sensitivity import measure_sensitivity
 from tuning.space import Space
 

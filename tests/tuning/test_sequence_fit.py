@@ -20,11 +20,11 @@ from tuning.config.data import Crops
 from tuning.config.fit import BlackBoxMethod, FilterSpec, GradientMethod, ObjectiveSpec, TuneConfig
 from tuning.data.blurring import arguments, blurred_sequence
 from tuning.data.variants import Variant
-from tuning.evaluation import score_cases
 from tuning.fit import run_fit
 from tuning.gradient import FitError, GradientJob, fit_gradient
 from tuning.problem import Problem
 from tuning.results.fit import FitResult
+from tuning.scoring.cases import score_cases
 from tuning.space import make_space
 from tuning.windows import make_samples
 

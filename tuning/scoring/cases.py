@@ -2,26 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor
 
-from torchblur.filters import BlurFilter
 from torchblur.metrics import evaluate
-from tuning.config.fit import GradientMethod, ObjectiveSpec
 from tuning.data.cases import AnyCase, Case, SequenceCase
 from tuning.data.variants import Variant, cut_of, render, render_frames
-from tuning.gradient import GradientJob, fit_gradient
-from tuning.problem import Problem
 from tuning.progress import Stage
 from tuning.results.fit import CaseScore
-from tuning.sequence_scores import finite_or_none, noisy_frames, score_frames
-from tuning.space import Space
-from tuning.windows import make_samples
+from tuning.scoring.sequences import finite_or_none, noisy_frames, score_frames
 
-__all__ = ["ceiling", "noise_scores", "score_cases", "score_image", "score_variant"]
+__all__ = ["noise_scores", "score_cases", "score_image", "score_variant"]
 
 
 def score_cases(
@@ -72,41 +65,6 @@ def noise_scores(case: Case) -> CaseScore:
     generator = torch.Generator().manual_seed(0)
     noise = torch.randn(case.reference.shape, generator=generator).to(case.reference)
     return score_image(case, "noise", case.reference + noise * case.variance.sqrt())
-
-
-def ceiling(
-    case: AnyCase,
-    blur: BlurFilter,
-    space: Space,
-    values: Mapping[str, Any],
-    objective: ObjectiveSpec,
-    steps: int,
-) -> Mapping[str, Any]:
-    """Return the parameters that suit one frame or sequence best: no common set beats them by much.
-
-    Args:
-        case: The frame, or the sequence.
-        blur: The filter.
-        space: All free parameters; the smooth ones are fitted.
-        values: The tuned values, where this fit begins.
-        objective: As in the fit.
-        steps: Steps of Adam.
-    """
-    specs = {p.name: p.spec for p in space.parameters}
-    smooth = space.subset(tuple(n for n, s in specs.items() if s.grad == "smooth"))
-    if not smooth.names:
-        return values
-    job = GradientJob(
-        method=GradientMethod(kind="gradient", steps=steps, starts=1),
-        index=0,
-        name=f"ceiling of {case.name}",
-        space=smooth,
-        fixed={name: value for name, value in values.items() if name not in smooth.names},
-        first=(values,),
-        seed=0,
-    )
-    samples = make_samples([case], None, tile_size=1, seed=0, blur=blur)
-    return fit_gradient(Problem(blur, samples, objective, space.names), job).params
 
 
 def score_image(case: Case, variant: str, image: Tensor) -> CaseScore:

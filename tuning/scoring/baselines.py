@@ -15,7 +15,7 @@ from torchblur.filters import BlurFilter
 from torchblur.frame import Frame
 from torchblur.metrics import border_band, evaluate, prepare_flip_ldr
 from torchblur.presets import create_filter
-from tuning.sequence_scores import FrameByFrame
+from tuning.scoring.sequences import FrameByFrame
 
 __all__ = ["BASELINES", "Scores", "SequenceJudge", "asked_name", "judge", "mean_scores"]
 
