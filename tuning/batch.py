@@ -25,7 +25,6 @@ from tuning.apply import FilterSettings, make_filter, recipe_of, samples_beside
 from tuning.cluster import Cluster
 from tuning.cluster_batch import run_on_cluster
 from tuning.config.fit import apply_overrides
-from tuning.engine import files_engine
 from tuning.files.frame_numbers import shots_of
 from tuning.files.outputs import (
     Job,
@@ -40,6 +39,7 @@ from tuning.files.outputs import (
     remove_leftovers,
     state_of,
 )
+from tuning.objective.engine import files_engine
 from tuning.progress import Progress, Stage
 from tuning.runner import Runner, Task, cores
 

@@ -26,7 +26,7 @@ from optuna.trial import FrozenTrial, Trial
 
 from tuning.config.methods import BlackBoxMethod
 from tuning.files.run_folder import RunFolder, trim_torn_line
-from tuning.space import FreeParameter
+from tuning.objective.space import FreeParameter
 
 __all__ = ["Journal", "make_pruner", "make_sampler", "new_study", "suggest"]
 

@@ -10,9 +10,9 @@ from tuning.config.methods import GradientMethod
 from tuning.config.objective import ObjectiveSpec
 from tuning.data.cases import AnyCase
 from tuning.gradient import GradientJob, fit_gradient
-from tuning.problem import Problem
-from tuning.space import Space
-from tuning.windows import make_samples
+from tuning.objective.problem import Problem
+from tuning.objective.space import Space
+from tuning.objective.windows import make_samples
 
 __all__ = ["ceiling"]
 

@@ -21,8 +21,8 @@ from torchblur.errors import TorchblurError
 from torchblur.params import build
 from tuning.cluster import Cluster, ClusterError, here, share_cores
 from tuning.config.fit import TuneConfig
-from tuning.preparation import fingerprint, is_same_data, prepare
-from tuning.problem import Problem
+from tuning.objective.prepare import fingerprint, is_same_data, prepare
+from tuning.objective.problem import Problem
 
 __all__ = ["ClusterProblem"]
 

@@ -30,7 +30,7 @@ from tuning.data.variants import Variant, cut_of
 from tuning.files.outputs import make_folders
 from tuning.files.run_folder import open_run
 from tuning.methods import run_methods
-from tuning.preparation import fit_device, prepare
+from tuning.objective.prepare import fit_device, prepare
 from tuning.progress import Progress, Stage
 from tuning.study import slug, source_hash
 from tuning.worker_pool import worker_pool

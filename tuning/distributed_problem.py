@@ -9,7 +9,7 @@ from typing import Any, Literal, Protocol
 import torch
 from torch import Tensor
 
-from tuning.problem import Problem
+from tuning.objective.problem import Problem
 
 __all__ = ["Crew", "Request", "Shard", "ShardedProblem"]
 

@@ -25,11 +25,11 @@ from optuna.trial import Trial
 from torch import Tensor
 
 from torchblur.errors import ConfigError
-from tuning.candidates import Evaluated, evaluate_candidates, reduced
 from tuning.config.methods import PruningSpec
-from tuning.problem import Problem
-from tuning.smaller import pixels_of
-from tuning.space import Space
+from tuning.objective.candidates import Evaluated, evaluate_candidates, reduced
+from tuning.objective.cropping import pixels_of
+from tuning.objective.problem import Problem
+from tuning.objective.space import Space
 
 __all__ = ["Climb", "Ladder", "Rung", "rung_sizes"]
 

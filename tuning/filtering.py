@@ -24,10 +24,10 @@ from tuning.apply import (
     write_job,
 )
 from tuning.config.fit import apply_overrides
-from tuning.engine import files_engine
 from tuning.files.frame_numbers import shots_of
 from tuning.files.images import read_color
 from tuning.files.outputs import Job, find_inputs, make_folders, name_outputs, numbered
+from tuning.objective.engine import files_engine
 from tuning.progress import Progress, Stage
 from tuning.scoring.baselines import Scores, SequenceJudge, asked_name, judge, mean_scores
 

@@ -26,10 +26,12 @@ from tuning.distributed import is_restarted, join_ranks
 from tuning.evidence import evidence_of
 from tuning.files.run_folder import RunFolder, open_run
 from tuning.methods import run_methods
+from tuning.objective.prepare import fit_device, prepare
+from tuning.objective.problem import Problem
+from tuning.objective.sensitivity import measure_sensitivity
+from tuning.objective.space import Space
 from tuning.pareto_files import write_pareto
 from tuning.pareto_scores import budget_notes, judged
-from tuning.preparation import fit_device, prepare
-from tuning.problem import Problem
 from tuning.progress import Progress, ProgressEvent, Stage
 from tuning.report import write_report
 from tuning.results.fit import (
@@ -40,8 +42,6 @@ from tuning.results.fit import (
     SensitivityResult,
 )
 from tuning.scoring.cases import score_cases, score_variant
-from tuning.sensitivity import measure_sensitivity
-from tuning.space import Space
 
 __all__ = ["run_fit"]
 

@@ -23,8 +23,8 @@ from tuning.gradient_state import (
     seed_of,
 )
 from tuning.lbfgs import LbfgsState
+from tuning.objective.problem import Problem
 from tuning.pool import Pool
-from tuning.problem import Problem
 from tuning.progress import Progress, Stage
 from tuning.results.fit import MethodResult, StartResult
 

@@ -16,8 +16,8 @@ from torch import Tensor
 from torchblur.errors import TorchblurError
 from tuning.config.fit import GradientMethod
 from tuning.job import MethodJob
-from tuning.problem import Problem
-from tuning.space import Space
+from tuning.objective.problem import Problem
+from tuning.objective.space import Space
 
 __all__ = [
     "AdamState",

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from tuning.space import Space
+from tuning.objective.space import Space
 
 __all__ = ["MethodJob"]
 

@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from tuning.gradient_state import GradientJob, State, losses_and_slopes
-from tuning.problem import Problem
+from tuning.objective.problem import Problem
 
 __all__ = ["LbfgsState"]
 

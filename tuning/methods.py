@@ -11,12 +11,12 @@ from tuning.config.fit import TuneConfig, free_names
 from tuning.config.methods import GradientMethod, ParetoMethod, polished_names
 from tuning.files.run_folder import RunFolder
 from tuning.gradient import GradientJob, fit_gradient, seed_of
+from tuning.objective.problem import Problem
+from tuning.objective.space import Space
 from tuning.pareto import ParetoJob, fit_pareto
 from tuning.pool import Pool
-from tuning.problem import Problem
 from tuning.progress import Progress
 from tuning.results.fit import MethodResult
-from tuning.space import Space
 
 __all__ = ["method_name", "run_methods"]
 

@@ -21,19 +21,19 @@ from optuna.samplers import BaseSampler, NSGAIISampler, TPESampler
 from optuna.trial import FrozenTrial, Trial, TrialState, create_trial
 
 from tuning.blackbox_study import new_study, suggest
-from tuning.candidates import evaluate_candidates
 from tuning.config.cost import cost_at
 from tuning.config.methods import ParetoMethod
 from tuning.files.run_folder import RunFolder
 from tuning.gradient import FitError, seed_of
 from tuning.job import MethodJob
+from tuning.objective.candidates import evaluate_candidates
+from tuning.objective.problem import Problem
+from tuning.objective.space import FreeParameter
 from tuning.polish import Polished, PolishStart, polish
-from tuning.problem import Problem
 from tuning.progress import Progress, Stage
 from tuning.results.fit import MethodResult
 from tuning.results.front import ParetoPoint, ParetoResult, front_of, make_point, pick
 from tuning.rounds import run_rounds
-from tuning.space import FreeParameter
 
 __all__ = ["ParetoJob", "fit_pareto"]
 

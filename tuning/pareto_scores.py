@@ -8,11 +8,11 @@ from typing import Any
 from torchblur.filters import BlurFilter, get_filter
 from tuning.config.cost import cost_at
 from tuning.data.cases import AnyCase
-from tuning.problem import Problem
+from tuning.objective.problem import Problem
+from tuning.objective.windows import make_samples
 from tuning.progress import Progress, Stage
 from tuning.results.fit import MethodResult
 from tuning.results.front import Origin, ParetoPoint, make_point
-from tuning.windows import make_samples
 
 __all__ = ["budget_notes", "judged"]
 

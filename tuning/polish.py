@@ -15,8 +15,8 @@ from typing import Any
 
 from tuning.config.methods import GradientMethod, PolishSteps
 from tuning.gradient import FitError, GradientJob, fit_gradient
-from tuning.problem import Problem
-from tuning.space import Space
+from tuning.objective.problem import Problem
+from tuning.objective.space import Space
 
 __all__ = ["PolishStart", "Polished", "is_promising", "polish"]
 

@@ -25,8 +25,8 @@ from tuning.data.cases import AnyCase
 from tuning.data.loading import draw_cases
 from tuning.distributed_problem import ShardedProblem
 from tuning.gradient_state import seed_of
-from tuning.problem import Problem
-from tuning.windows import AnySample, make_samples
+from tuning.objective.problem import Problem
+from tuning.objective.windows import AnySample, make_samples
 
 __all__ = ["Pool"]
 

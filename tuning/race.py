@@ -25,14 +25,14 @@ from tuning.data.cases import AnyCase, Case
 from tuning.data.variants import Variant, render
 from tuning.files.run_folder import RunFolder, open_run
 from tuning.methods import run_methods
-from tuning.preparation import prepare
-from tuning.problem import Problem
+from tuning.objective.prepare import prepare
+from tuning.objective.problem import Problem
+from tuning.objective.space import Space
+from tuning.objective.windows import make_samples
 from tuning.progress import Progress, Stage
 from tuning.race_config import Entrant, RaceConfig, RaceProblem
 from tuning.results.fit import MethodResult
-from tuning.space import Space
 from tuning.study import slug
-from tuning.windows import make_samples
 
 __all__ = ["Curve", "Point", "grid", "run_race"]
 

@@ -15,7 +15,7 @@ from tuning.cluster import ClusterError, open_cluster
 from tuning.cluster_problem import ClusterProblem
 from tuning.config.fit import TuneConfig
 from tuning.fit import run_fit
-from tuning.preparation import prepare
+from tuning.objective.prepare import prepare
 
 METHODS = [
     {

@@ -11,7 +11,7 @@ from torchblur.params import build
 from torchblur.presets import Preset, save_preset
 from tuning.config.fit import TuneConfig, load_tune_config, resolve
 from tuning.config.overrides import apply_overrides
-from tuning.space import make_space
+from tuning.objective.space import make_space
 
 BASE = {
     "filter": {"kind": "guertin2014", "params": {"num_samples": 15}, "free": ["kappa"]},

@@ -10,8 +10,8 @@ from torchblur.filters.base import FilterConfig
 from torchblur.params import declared
 from tuning.config.cost import Cost, cost_at, cost_of
 from tuning.config.fit import ObjectiveSpec
-from tuning.problem import Problem
-from tuning.windows import make_samples
+from tuning.objective.problem import Problem
+from tuning.objective.windows import make_samples
 
 TAPS = {
     "line": ("num_samples",),

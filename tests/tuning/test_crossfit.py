@@ -27,7 +27,7 @@ from tuning.crossfit_config import Bootstrap, load_crossfit_config
 from tuning.crossfit_files import write_crossfit
 from tuning.crossfit_summary import MEAN, final_variants, is_met, mean_names, summary_of, verdicts
 from tuning.crossfit_tiles import GAINS, METRICS, Figure, Sums, draws_of, figures_of, summarize
-from tuning.preparation import prepare
+from tuning.objective.prepare import prepare
 
 FILES = {"sharp": "sharp.####.exr", "reference": "reference.####.exr"}
 CASES = {"one": 1, "two": 2, "three": 1}

@@ -17,7 +17,7 @@ from torchblur.io import write_frame, write_image
 from torchblur.params import build
 from tuning.config.data import Crops, DataSpec
 from tuning.data.loading import cache_folder, load_cases
-from tuning.windows import make_samples
+from tuning.objective.windows import make_samples
 
 SCENE = """
 camera: {position: [0, 0, 5]}

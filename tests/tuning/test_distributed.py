@@ -21,7 +21,7 @@ from tuning.config.fit import load_tune_config
 from tuning.distributed import Ranks, rank_here
 from tuning.distributed_problem import Shard
 from tuning.fit import run_fit
-from tuning.preparation import fingerprint, prepare
+from tuning.objective.prepare import fingerprint, prepare
 
 TORCHRUN = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2"]
 

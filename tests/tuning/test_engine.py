@@ -13,9 +13,9 @@ from torchblur.io import load_yaml, save_yaml
 from torchblur.ops import compiling
 from tuning.commands import app
 from tuning.config.fit import TuneConfig, resolve
-from tuning.engine import files_engine, fit_engine
 from tuning.files.outputs import Job
-from tuning.space import make_space
+from tuning.objective.engine import files_engine, fit_engine
+from tuning.objective.space import make_space
 
 
 @pytest.fixture(autouse=True)

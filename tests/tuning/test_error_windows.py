@@ -7,15 +7,14 @@ import torch
 from planted import FIXED, PLANTED, planted_case, tiny_frame
 from planted_sequences import sequence_case
 
-import tuning.error_maps
+import tuning.objective.windows
 from torchblur.errors import ConfigError
 from torchblur.filters import get_filter
 from torchblur.frame import Frame, Shutter
 from torchblur.metrics import flip_ldr
 from torchblur.params import build
 from tuning.config.data import Crops
-from tuning.error_maps import error_map
-from tuning.windows import make_samples
+from tuning.objective.windows import error_map, make_samples
 
 ERROR = Crops(size=16, per_frame=8, context=0, choose="error")
 
@@ -69,7 +68,7 @@ class TestMap:
         case = planted_case(1)
         broken = case.reference.clone()
         broken[:, 1, 10, 20] = torch.nan
-        monkeypatch.setattr(tuning.error_maps, "blurred", lambda *_: broken)
+        monkeypatch.setattr(tuning.objective.windows, "blurred", lambda *_: broken)
         map = error_map(case, blur())
         assert bool(torch.isfinite(map).all())
         assert float(map[0, 0, 10, 20]) == 1

@@ -7,7 +7,7 @@ import torch
 from planted import PLANTED, write_planted
 
 import tuning.gradient_state
-import tuning.groups
+import tuning.objective.batches
 from torchblur.errors import ConfigError, OutputError
 from torchblur.io import load_yaml, read_frame, read_image
 from torchblur.metrics import psnr
@@ -18,9 +18,9 @@ from tuning.config.fit import BlackBoxMethod, FilterSpec, GradientMethod, TuneCo
 from tuning.data.blurring import blurred
 from tuning.fit import run_fit
 from tuning.gradient import FitError, GradientJob, fit_gradient
+from tuning.objective.sensitivity import sensitivities
+from tuning.objective.space import make_space
 from tuning.results.fit import FitResult
-from tuning.sensitivity import sensitivities
-from tuning.space import make_space
 
 
 def space_of(free, **params):
@@ -144,7 +144,7 @@ class TestBadLosses:
                 kappa = torch.as_tensor(values["kappa"]).view(-1, 1, 1, 1)
                 return torch.where(kappa > limit, torch.nan, image)
 
-            monkeypatch.setattr(tuning.groups, "blurred", broken)
+            monkeypatch.setattr(tuning.objective.batches, "blurred", broken)
 
         return break_it
 

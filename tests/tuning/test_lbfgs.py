@@ -16,10 +16,10 @@ from tuning.config.methods import GradientMethod
 from tuning.files.run_folder import RunFolder
 from tuning.gradient import FitError, GradientJob, fit_gradient
 from tuning.gradient_state import losses_and_slopes
-from tuning.groups import FrameGroup
 from tuning.lbfgs import LbfgsState
-from tuning.problem import Problem
-from tuning.space import make_space
+from tuning.objective.batches import FrameGroup
+from tuning.objective.problem import Problem
+from tuning.objective.space import make_space
 
 TIMES = {"seconds", "cpu_seconds", "spent"}
 

@@ -17,9 +17,8 @@ from tuning.config.fit import TuneConfig, resolve
 from tuning.config.objective import ObjectiveSpec
 from tuning.data.loading import load_cases
 from tuning.fit import run_fit
-from tuning.mixture import window_weights
-from tuning.problem import Problem
-from tuning.windows import make_samples
+from tuning.objective.problem import Problem
+from tuning.objective.windows import make_samples, window_weights
 
 FAMILY = """
 groups:

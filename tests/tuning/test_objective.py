@@ -12,9 +12,9 @@ from torchblur.metrics import flip_hdr, flip_ldr, ssim
 from tuning.config.data import Crops
 from tuning.config.fit import ObjectiveSpec
 from tuning.data.blurring import blurred
-from tuning.objective import prepare_objective
-from tuning.problem import Problem
-from tuning.windows import make_samples
+from tuning.objective.problem import Problem
+from tuning.objective.terms import prepare_objective
+from tuning.objective.windows import make_samples
 
 
 @pytest.fixture
@@ -177,7 +177,7 @@ def test_a_set_without_a_finite_image_is_alone_with_it(monkeypatch):
         image = blurred(blur, frame, shutter, position, values, free)
         return torch.where(torch.tensor([False, True]).view(-1, 1, 1, 1), torch.nan, image)
 
-    monkeypatch.setattr("tuning.groups.blurred", broken)
+    monkeypatch.setattr("tuning.objective.batches.blurred", broken)
     values = {"kappa": torch.tensor([10.0, 10.0], dtype=torch.float64, requires_grad=True)}
     losses = sum(problem.losses(values, 2))
     losses[0].backward()

@@ -12,9 +12,9 @@ from tuning.config.fit import FilterSpec
 from tuning.config.methods import ParetoMethod, PolishSteps
 from tuning.files.run_folder import RunFolder
 from tuning.gradient import FitError
+from tuning.objective.space import make_space
 from tuning.pareto import ParetoJob, fit_pareto
 from tuning.results.front import ParetoPoint, front_of, pick
-from tuning.space import make_space
 
 TAPS = (3, 7, 11, 24)
 

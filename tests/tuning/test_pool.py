@@ -8,7 +8,7 @@ import torch
 from planted import planted_case
 from planted_sequences import sequence_case
 
-import tuning.meter
+import tuning.objective.cpu_time
 from torchblur.errors import ConfigError
 from torchblur.params import build
 from torchblur.render import draw_scene, load_family
@@ -16,12 +16,12 @@ from tuning.config.fit import TuneConfig, resolve
 from tuning.config.objective import ObjectiveSpec
 from tuning.distributed_problem import ShardedProblem
 from tuning.fit import run_fit
-from tuning.groups import FrameGroup, SequenceGroup, join
-from tuning.meter import Meter
+from tuning.objective.batches import FrameGroup, SequenceGroup, join
+from tuning.objective.cpu_time import Meter
+from tuning.objective.prepare import prepare
+from tuning.objective.windows import make_samples
 from tuning.pool import Pool
-from tuning.preparation import prepare
 from tuning.race_config import load_race_config
-from tuning.windows import make_samples
 
 CONFIGS = Path(__file__).parents[2] / "configs"
 TINY = {"size": "48x28", "spp": 4, "color_spp": 2}
@@ -243,7 +243,7 @@ class _Ticks(torch.autograd.Function):
 @pytest.mark.parametrize("kind", ["frame", "sequence"])
 def test_what_is_counted_where(monkeypatch, kind):
     """The filter takes 1 s and 10 s back, the metric 100 s and 1000 s back, for each frame."""
-    monkeypatch.setattr(tuning.meter.time, "process_time", lambda: _Ticks.clock)
+    monkeypatch.setattr(tuning.objective.cpu_time.time, "process_time", lambda: _Ticks.clock)
     case, frames = (planted_case(1), 1) if kind == "frame" else (sequence_case(3), 3)
     (sample,) = make_samples([case], None, tile_size=12, seed=0)
     group = join([sample], ObjectiveSpec(terms={"mse": 1.0}))
@@ -254,14 +254,14 @@ def test_what_is_counted_where(monkeypatch, kind):
         return _Ticks.apply(sample_color * gain, 1.0, 10.0)
 
     sample_color = (sample.frame if kind == "frame" else sample.steps[0][0]).color
-    monkeypatch.setattr("tuning.groups.blurred", slow_filter)
+    monkeypatch.setattr("tuning.objective.batches.blurred", slow_filter)
     monkeypatch.setattr(
-        "tuning.groups.blurred_sequence",
+        "tuning.objective.batches.blurred_sequence",
         lambda *args, **more: (slow_filter() for _ in range(frames)),
     )
     call = type(group.objective if kind == "frame" else group.objectives[0]).__call__
     monkeypatch.setattr(
-        "tuning.objective.PreparedObjective.__call__",
+        "tuning.objective.terms.PreparedObjective.__call__",
         lambda self, image: call(self, _Ticks.apply(image, 100.0, 1000.0)),
     )
     meter = Meter()

@@ -7,9 +7,9 @@ from planted import FIXED, PLANTED, planted_case
 from torchblur.filters import get_filter
 from tuning.config.data import Crops
 from tuning.config.fit import ObjectiveSpec
-from tuning.problem import Problem
-from tuning.reduction import tail_weights
-from tuning.windows import make_samples
+from tuning.objective.problem import Problem
+from tuning.objective.terms import tail_weights
+from tuning.objective.windows import make_samples
 
 
 def spec(reduction, tail=0.25, **options):

@@ -18,7 +18,7 @@ from tuning.blackbox import BlackBoxJob, fit_blackbox
 from tuning.config.fit import BlackBoxMethod, FilterSpec, TuneConfig, load_tune_config
 from tuning.files.run_folder import RunFolder, open_run, trim_torn_line
 from tuning.fit import run_fit
-from tuning.space import make_space
+from tuning.objective.space import make_space
 
 RUN = """
 import sys

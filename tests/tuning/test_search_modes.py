@@ -15,18 +15,18 @@ from torchblur.filters import get_filter
 from torchblur.params import build
 from tuning.blackbox import BlackBoxJob, fit_blackbox
 from tuning.blackbox_study import Journal
-from tuning.candidates import evaluate_candidates
 from tuning.config.fit import FilterSpec, TuneConfig, resolve
 from tuning.config.methods import BlackBoxMethod, PruningSpec
 from tuning.config.objective import ObjectiveSpec
 from tuning.fidelity import Ladder, rung_sizes
 from tuning.files.run_folder import RunFolder
 from tuning.fit import run_fit
-from tuning.groups import FrameGroup
+from tuning.objective.batches import FrameGroup
+from tuning.objective.candidates import evaluate_candidates
+from tuning.objective.problem import Problem
+from tuning.objective.space import make_space
+from tuning.objective.windows import make_samples
 from tuning.polish import is_promising
-from tuning.problem import Problem
-from tuning.space import make_space
-from tuning.windows import make_samples
 
 FREE = {
     "kappa": {"low": 1, "high": 50}, "third_gain": {"high": 10},

@@ -7,10 +7,15 @@ import torch
 from planted import FIXED, PLANTED
 
 from tuning.config.fit import FilterSpec
+from tuning.objective.sensitivity import (
+    Differences,
+    differences,
+    gradient_slopes,
+    measure_sensitivity,
+)
+from tuning.objective.space import make_space
 from tuning.results.fit import SensitivityResult
-from tuning.sensitivity import Differences, differences, gradient_slopes, measure_sensitivity
 from tuning.sensitivity_rows import _is_misled
-from tuning.space import make_space
 
 START = dict(PLANTED, third_gain=8.0, kappa=12.0)
 

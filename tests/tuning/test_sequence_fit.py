@@ -9,7 +9,7 @@ import torch
 from planted import planted_case
 from planted_sequences import PLANTED_GAIN, Recall, moving_sequence, sequence_case, write_sequences
 
-import tuning.groups
+import tuning.objective.batches
 from torchblur.errors import ConfigError
 from torchblur.filters import get_filter
 from torchblur.metrics import flip_ldr, temporal_errors
@@ -22,11 +22,11 @@ from tuning.data.blurring import arguments, blurred_sequence
 from tuning.data.variants import Variant
 from tuning.fit import run_fit
 from tuning.gradient import FitError, GradientJob, fit_gradient
-from tuning.problem import Problem
+from tuning.objective.problem import Problem
+from tuning.objective.space import make_space
+from tuning.objective.windows import make_samples
 from tuning.results.fit import FitResult
 from tuning.scoring.cases import score_cases
-from tuning.space import make_space
-from tuning.windows import make_samples
 
 LINEAR = {"terms": {"mse": 1.0}, "color_space": "linear"}
 
@@ -239,7 +239,7 @@ class TestBadLosses:
                     gain = torch.as_tensor(given["gain"]).view(-1, 1, 1, 1)
                     yield torch.where((gain > limit) & (index == 2), torch.nan, image)
 
-            monkeypatch.setattr(tuning.groups, "blurred_sequence", broken)
+            monkeypatch.setattr(tuning.objective.batches, "blurred_sequence", broken)
 
         return break_it
 

@@ -15,11 +15,11 @@ from tuning.config.fit import ObjectiveSpec, TuneConfig, resolve
 from tuning.config.methods import PruningSpec
 from tuning.distributed_problem import Shard, ShardedProblem
 from tuning.fidelity import Ladder, rung_sizes
-from tuning.groups import FrameGroup
-from tuning.preparation import prepare
-from tuning.problem import Problem
-from tuning.smaller import pixels_of, smaller
-from tuning.windows import make_samples
+from tuning.objective.batches import FrameGroup
+from tuning.objective.cropping import pixels_of, smaller
+from tuning.objective.prepare import prepare
+from tuning.objective.problem import Problem
+from tuning.objective.windows import make_samples
 
 
 def windows(crops=None, seeds=(1, 2, 3, 4)):

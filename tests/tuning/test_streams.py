@@ -16,7 +16,7 @@ from tuning.config.data import Crops, DataSpec
 from tuning.data.cases import SequenceCase, check_needs
 from tuning.data.loading import load_cases
 from tuning.data.streams import shot_starts
-from tuning.windows import make_samples
+from tuning.objective.windows import make_samples
 
 SCENE = """
 camera: {position: [0, 0, 5]}

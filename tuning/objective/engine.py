@@ -17,9 +17,9 @@ from torchblur.ops.gather import Engine
 from tuning.config.fit import TuneConfig
 from tuning.config.methods import GradientMethod, Method, ParetoMethod
 from tuning.files.outputs import Job
-from tuning.problem import Problem
-from tuning.smaller import pixels_of
-from tuning.space import Space
+from tuning.objective.cropping import pixels_of
+from tuning.objective.problem import Problem
+from tuning.objective.space import Space
 
 __all__ = ["files_engine", "fit_engine"]
 

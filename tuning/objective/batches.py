@@ -13,9 +13,9 @@ from torchblur.filters import BlurFilter
 from torchblur.frame import Frame
 from tuning.config.fit import ObjectiveSpec
 from tuning.data.blurring import arguments, blurred, blurred_sequence
-from tuning.meter import Meter
-from tuning.objective import PreparedObjective, prepare_objective
-from tuning.windows import AnySample, Sample, SequenceSample
+from tuning.objective.cpu_time import Meter
+from tuning.objective.terms import PreparedObjective, prepare_objective
+from tuning.objective.windows import AnySample, Sample, SequenceSample
 
 __all__ = ["AnyGroup", "FrameGroup", "SequenceGroup", "join", "kind_of"]
 

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from torchblur.frame import Frame
 from tuning.data.framing import MOVING
-from tuning.windows import AnySample, Sample
+from tuning.objective.windows import AnySample, Sample
 
 __all__ = ["pixels_of", "smaller"]
 

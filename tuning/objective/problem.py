@@ -11,11 +11,11 @@ from torch import Tensor
 from torchblur.filters import BlurFilter
 from tuning.config.cost import cost_at
 from tuning.config.objective import ObjectiveSpec
-from tuning.groups import AnyGroup, join, kind_of
-from tuning.meter import Meter
-from tuning.reduction import tail_weights
-from tuning.smaller import smaller
-from tuning.windows import AnySample
+from tuning.objective.batches import AnyGroup, join, kind_of
+from tuning.objective.cpu_time import Meter
+from tuning.objective.cropping import smaller
+from tuning.objective.terms import tail_weights
+from tuning.objective.windows import AnySample
 
 __all__ = ["Problem"]
 

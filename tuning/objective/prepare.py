@@ -14,10 +14,10 @@ from torchblur.filters import BlurFilter, get_filter
 from tuning.config.fit import TuneConfig
 from tuning.data.cases import AnyCase, check_needs
 from tuning.data.loading import load_cases
-from tuning.engine import fit_engine
-from tuning.problem import Problem
-from tuning.space import Space, make_space
-from tuning.windows import AnySample, Sample, make_samples
+from tuning.objective.engine import fit_engine
+from tuning.objective.problem import Problem
+from tuning.objective.space import Space, make_space
+from tuning.objective.windows import AnySample, Sample, make_samples
 
 __all__ = ["Prepared", "fingerprint", "fit_device", "is_same_data", "prepare"]
 

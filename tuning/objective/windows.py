@@ -10,16 +10,16 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from torchblur.filters import BlurFilter
+from torchblur.filters import BlurFilter, get_filter
 from torchblur.filters.reach import ReachingBlur
 from torchblur.frame import Frame, Shutter
+from torchblur.metrics import flip_ldr
 from tuning.config.data import Crops
+from tuning.data.blurring import arguments, blurred, blurred_sequence
 from tuning.data.cases import AnyCase, Case
 from tuning.data.framing import MOVING
-from tuning.error_maps import error_map
-from tuning.mixture import window_weights
 
-__all__ = ["AnySample", "Sample", "SequenceSample", "make_samples"]
+__all__ = ["AnySample", "Sample", "SequenceSample", "error_map", "make_samples", "window_weights"]
 
 _CANDIDATE_STEPS = 8  # windows are placed on a grid of 1/8 of their size
 
@@ -257,3 +257,59 @@ def _outer(start: int, length: int, edge: int, context: int, tile_size: int) -> 
         return 0, edge
     first = max(0, start - context) // tile_size * tile_size
     return min(first, edge - wanted), wanted
+
+
+def window_weights(cases: Sequence[AnyCase], counts: Sequence[int]) -> list[float]:
+    """Return the weight of each window of each case; over all windows their mean is 1.
+
+    An item of the data counts by its weight, however many frames and windows it has, and each of
+    its windows by the same share of it. Without any weights all windows count alike.
+
+    Args:
+        cases: The training frames and sequences; an item without a weight has 1 beside items that
+            have one.
+        counts: Number of windows of each case.
+    """
+    if all(case.weight is None for case in cases):
+        return [1.0] * len(cases)
+    shares: dict[str, float] = {}
+    windows: dict[str, int] = {}
+    for case, count in zip(cases, counts, strict=True):
+        shares[case.item] = 1.0 if case.weight is None else case.weight
+        windows[case.item] = windows.get(case.item, 0) + count
+    scale = sum(windows.values()) / sum(shares.values())
+    return [scale * shares[case.item] / windows[case.item] for case in cases]
+
+
+@torch.no_grad()
+def error_map(case: AnyCase, blur: BlurFilter | None = None) -> Tensor:
+    """Return the FLIP of a filter's output against the reference, (1, 1, H, W), float64, CPU.
+
+    A pixel that is not finite has error 1, the greatest. Of a sequence it is the mean over the
+    frames that are scored.
+
+    Args:
+        case: The frame, or the sequence.
+        blur: The filter with its values; a blur along the pixel's own velocity if left out.
+
+    Differentiable: no.
+    Reference: Andersson et al. 2020 (FLIP).
+    """
+    blur = get_filter("line")() if blur is None else blur
+    if isinstance(case, Case):
+        image = blurred(blur, case.frame, case.shutter.open, case.shutter.position, {})
+        maps = [_flip(image, case.reference)]
+    else:
+        given = arguments(
+            case.shutter.open, case.shutter.position, {}, (), case.references[0].device
+        )
+        images = blurred_sequence(blur, case.steps(blur), case.cuts, given)
+        pairs = list(zip(images, case.references, strict=True))[case.warm_up :]
+        maps = [_flip(image, reference) for image, reference in pairs]
+    return torch.stack(maps).mean(dim=0)
+
+
+def _flip(image: Tensor, reference: Tensor) -> Tensor:
+    finite = torch.isfinite(image).all(dim=1, keepdim=True)
+    map = flip_ldr(torch.where(finite, image, 0.0), reference)
+    return torch.where(finite, map, 1.0).to(device="cpu", dtype=torch.float64)

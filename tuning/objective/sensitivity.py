@@ -16,10 +16,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from tuning.problem import Problem
+from tuning.objective.problem import Problem
+from tuning.objective.space import Space
 from tuning.progress import Progress, Stage
 from tuning.results.fit import SensitivityResult
-from tuning.space import Space
 
 __all__ = ["Differences", "differences", "gradient_slopes", "measure_sensitivity", "sensitivities"]
 

@@ -12,9 +12,9 @@ import torch
 from torch import Tensor
 
 from tuning.config.objective import ObjectiveSpec
-from tuning.problem import Problem
-from tuning.reduction import tail_weights
-from tuning.space import Space
+from tuning.objective.problem import Problem
+from tuning.objective.space import Space
+from tuning.objective.terms import tail_weights
 
 __all__ = ["Evaluated", "evaluate_candidates", "reduced"]
 
