@@ -22,7 +22,6 @@ from torchblur.filters.base import TemporalBlur
 from torchblur.io import load_yaml
 from torchblur.params import build
 from tuning.apply import FilterSettings, make_filter, recipe_of, samples_beside
-from tuning.cluster import Cluster
 from tuning.cluster_batch import run_on_cluster
 from tuning.config.fit import apply_overrides
 from tuning.files.frame_numbers import shots_of
@@ -40,8 +39,10 @@ from tuning.files.outputs import (
     state_of,
 )
 from tuning.objective.engine import files_engine
+from tuning.parallel.cluster import Cluster
+from tuning.parallel.cores import count_cores
 from tuning.progress import Progress, Stage
-from tuning.runner import Runner, Task, cores
+from tuning.runner import Runner, Task
 
 __all__ = [
     "BatchConfig",
@@ -188,7 +189,7 @@ def plan_batch(config: BatchConfig, *, overwrite: bool = False) -> Plan:
     if isinstance(blur, TemporalBlur):
         found = _shot_states(shots_of(jobs, config.cuts), recipe)
         return Plan(config, recipe, tuple(found), overwrite, in_order=True)
-    with ThreadPoolExecutor(cores()) as pool:
+    with ThreadPoolExecutor(count_cores()) as pool:
         states = list(pool.map(lambda job: state_of(job.output, job.sources, recipe), jobs))
     return Plan(config, recipe, tuple(zip(jobs, states, strict=True)), overwrite)
 
@@ -276,7 +277,7 @@ def _shot_states(
 ) -> list[tuple[Job, State]]:
     """Return the state of each frame: one is as old as the oldest that it follows."""
     names = [(job, shot[0].source.name) for shot in shots for job in shot]
-    with ThreadPoolExecutor(cores()) as pool:
+    with ThreadPoolExecutor(count_cores()) as pool:
         found = pool.map(lambda e: state_of(e[0].output, e[0].sources, recipe, e[1]), names)
         states = dict(zip([job for job, _ in names], found, strict=True))
     for shot in shots:

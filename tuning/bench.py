@@ -21,10 +21,11 @@ from torchblur.params import Config
 from tuning.apply import device_named
 from tuning.bench_cases import Case, Report, Row, Table
 from tuning.bench_child import MARK, BenchJob
-from tuning.bench_machine import busy_warning, count_cores, describe_machine, watch
+from tuning.bench_machine import busy_warning, describe_machine, watch
 from tuning.bench_plan import BenchOptions, TablePlan, plan_tables, unique_cases
 from tuning.bench_ratios import fits_of, with_ratios
 from tuning.bench_targets import judge_targets, targets_for
+from tuning.parallel.cores import count_cores
 from tuning.progress import Progress, Stage
 
 __all__ = ["Limits", "check_output", "measure_cases", "run_bench", "write_report"]

@@ -12,11 +12,12 @@ from typing import Any
 
 import torch
 
+from tuning.parallel.cores import count_cores
+
 __all__ = [
     "BUSY",
     "CpuTicks",
     "busy_warning",
-    "count_cores",
     "describe_machine",
     "other_cores",
     "read_ticks",
@@ -86,13 +87,6 @@ def watch(seconds: float = 0.5) -> float | None:
     own, before = time.process_time(), read_ticks()
     time.sleep(seconds)
     return other_cores(before, read_ticks(), time.process_time() - own)
-
-
-def count_cores() -> int:
-    """Return how many cores this process may use."""
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
 
 
 def describe_machine(device: str, threads: int) -> dict[str, Any]:

@@ -22,8 +22,8 @@ from torchblur.filters import BlurFilter
 from torchblur.ops.compiling import compiler_works
 from torchblur.ops.gather import Engine
 from tuning.apply import FilterSettings, make_filter
-from tuning.cluster import Cluster, ClusterError, Lost, here, share_cores
 from tuning.files.outputs import Job
+from tuning.parallel.cluster import Cluster, ClusterError, Lost, here, share_cores
 from tuning.runner import Log, Runner, Task
 
 __all__ = ["run_on_cluster"]

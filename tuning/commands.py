@@ -27,7 +27,7 @@ from tuning.race_command import race
 from tuning.render_command import render
 
 if TYPE_CHECKING:
-    from tuning.cluster import Cluster
+    from tuning.parallel.cluster import Cluster
 
 __all__ = ["app"]
 
@@ -169,8 +169,8 @@ def tune(  # noqa: PLR0913 - each argument is an option
     (`population`); `torchrun -m tuning tune CONFIG` splits the windows of each step.
     """
     from tuning.config.fit import load_tune_config
-    from tuning.distributed import RankZeroStoppedError, rank_here
     from tuning.fit import run_fit
+    from tuning.parallel.ranks import RankZeroStoppedError, rank_here
     from tuning.printing import print_fit
     from tuning.track import tracking
 
@@ -388,7 +388,7 @@ def _cluster(
 ) -> AbstractContextManager[Cluster | None]:
     if scheduler is None and workers is None:
         return nullcontext()
-    from tuning.cluster import open_cluster
+    from tuning.parallel.cluster import open_cluster
 
     return open_cluster(scheduler, workers=workers)
 

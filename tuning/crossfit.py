@@ -31,9 +31,9 @@ from tuning.files.outputs import make_folders
 from tuning.files.run_folder import open_run
 from tuning.methods import run_methods
 from tuning.objective.prepare import fit_device, prepare
+from tuning.parallel.processes import worker_pool
 from tuning.progress import Progress, Stage
 from tuning.study import slug, source_hash
-from tuning.worker_pool import worker_pool
 
 __all__ = ["Crossfit", "Fold", "Scored", "run_crossfit"]
 

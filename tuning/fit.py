@@ -17,12 +17,9 @@ from typing import Any
 from torchblur.filters import BlurFilter, get_filter
 from torchblur.presets import Preset, save_preset
 from tuning.ceiling import ceiling
-from tuning.cluster import Cluster, ClusterError
-from tuning.cluster_problem import ClusterProblem
 from tuning.config.fit import GradientMethod, TuneConfig, resolve
 from tuning.data.cases import AnyCase, SequenceCase
 from tuning.data.variants import Variant
-from tuning.distributed import is_restarted, join_ranks
 from tuning.evidence import evidence_of
 from tuning.files.run_folder import RunFolder, open_run
 from tuning.methods import run_methods
@@ -30,6 +27,9 @@ from tuning.objective.prepare import fit_device, prepare
 from tuning.objective.problem import Problem
 from tuning.objective.sensitivity import measure_sensitivity
 from tuning.objective.space import Space
+from tuning.parallel.cluster import Cluster, ClusterError
+from tuning.parallel.cluster_problem import ClusterProblem
+from tuning.parallel.ranks import is_restarted, join_ranks
 from tuning.pareto_files import write_pareto
 from tuning.pareto_scores import budget_notes, judged
 from tuning.progress import Progress, ProgressEvent, Stage

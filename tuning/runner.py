@@ -5,7 +5,6 @@ A task is one frame, or for a filter with a memory all frames of a shot, one aft
 
 from __future__ import annotations
 
-import os
 import threading
 from collections import deque
 from collections.abc import Collection, Iterable, Mapping, Sequence
@@ -23,8 +22,9 @@ from torchblur.frame import Frame
 from torchblur.ops.compiling import compiler_works
 from tuning.apply import FilterSettings, blur_frame, blur_step, read_samples, write_job
 from tuning.files.outputs import Job
+from tuning.parallel.cores import count_cores
 
-__all__ = ["Log", "Runner", "Task", "cores"]
+__all__ = ["Log", "Runner", "Task"]
 
 
 @dataclass(frozen=True)
@@ -89,7 +89,7 @@ class Runner:
         """Run the tasks; return whether the user stopped them."""
         threads = torch.get_num_threads()
         share = 1 if self._turn else self._workers
-        torch.set_num_threads(min(threads, max(1, cores() // share)))
+        torch.set_num_threads(min(threads, max(1, count_cores() // share)))
         workers = ThreadPoolExecutor(
             self._workers, "blur", torch.set_num_threads, (torch.get_num_threads(),)
         )
@@ -191,11 +191,6 @@ class Runner:
         for job in task.jobs[index:]:
             if job in task.wanted:
                 self._log.failed(job, reason if job is bad else after)
-
-
-def cores() -> int:
-    """Return the number of cores that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def _collect(running: set[Future[None]]) -> None:

@@ -75,7 +75,7 @@ class TestResults:
             return original(*args)
 
         monkeypatch.setattr(tuning.runner, "blur_frame", watched)
-        monkeypatch.setattr(tuning.runner, "cores", lambda: 4)
+        monkeypatch.setattr(tuning.runner, "count_cores", lambda: 4)
         before = torch.get_num_threads()
         torch.set_num_threads(4)
         try:

@@ -11,12 +11,12 @@ import torch
 from tuning.bench_machine import (
     CpuTicks,
     busy_warning,
-    count_cores,
     describe_machine,
     other_cores,
     read_ticks,
     watch,
 )
+from tuning.parallel.cores import count_cores
 
 TICK = 1 / os.sysconf("SC_CLK_TCK")
 

@@ -9,10 +9,10 @@ import pytest
 from clusters import threads_cluster
 from typer.testing import CliRunner
 
-import tuning.cluster
+import tuning.parallel.cluster
 from torchblur.errors import ConfigError
-from tuning.cluster import ClusterError, open_cluster
 from tuning.commands import app
+from tuning.parallel.cluster import ClusterError, open_cluster
 
 
 @pytest.fixture(scope="module")
@@ -73,7 +73,7 @@ class TestConnecting:
             pass
 
     def test_no_scheduler(self, monkeypatch):
-        monkeypatch.setattr(tuning.cluster, "_CONNECT", 0.5)
+        monkeypatch.setattr(tuning.parallel.cluster, "_CONNECT", 0.5)
         with (
             pytest.raises(ClusterError, match=r"no Dask scheduler answers at 'tcp://127.0.0.1:9'"),
             open_cluster("tcp://127.0.0.1:9"),

@@ -15,10 +15,10 @@ import tuning.cluster_batch
 from torchblur.io import read_image, save_yaml, write_frame
 from torchblur.presets import Preset, save_preset
 from tuning.batch import BatchConfig, plan_batch, run_batch
-from tuning.cluster import ClusterError, Lost, open_cluster
 from tuning.cluster_batch import _collect, _make, _Order, _Told
 from tuning.commands import app
 from tuning.files.outputs import Job
+from tuning.parallel.cluster import ClusterError, Lost, open_cluster
 from tuning.runner import Task
 
 

@@ -9,13 +9,13 @@ import pytest
 from clusters import threads_cluster
 from planted import write_planted
 
-import tuning.cluster_problem
+import tuning.parallel.cluster_problem
 from torchblur.params import build
-from tuning.cluster import ClusterError, open_cluster
-from tuning.cluster_problem import ClusterProblem
 from tuning.config.fit import TuneConfig
 from tuning.fit import run_fit
 from tuning.objective.prepare import prepare
+from tuning.parallel.cluster import ClusterError, open_cluster
+from tuning.parallel.cluster_problem import ClusterProblem
 
 METHODS = [
     {
@@ -80,7 +80,7 @@ def assert_same(result, folder, one_process):
 def test_driver_stopped_in_the_middle(config, cluster, tmp_path, one_process, monkeypatch):
     built = []
     monkeypatch.setattr(
-        tuning.cluster_problem, "prepare", lambda given: built.append(1) or prepare(given)
+        tuning.parallel.cluster_problem, "prepare", lambda given: built.append(1) or prepare(given)
     )
 
     def stop(event):

@@ -16,12 +16,12 @@ from planted import planted_case, write_planted
 
 from torchblur.io import save_yaml, write_frame, write_image
 from torchblur.presets import load_preset
-from tuning.cluster import Cluster, ClusterError
 from tuning.config.fit import load_tune_config
-from tuning.distributed import Ranks, rank_here
-from tuning.distributed_problem import Shard
 from tuning.fit import run_fit
 from tuning.objective.prepare import fingerprint, prepare
+from tuning.parallel.cluster import Cluster, ClusterError
+from tuning.parallel.ranks import Ranks, rank_here
+from tuning.parallel.sharded_problem import Shard
 
 TORCHRUN = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2"]
 

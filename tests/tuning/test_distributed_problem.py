@@ -7,9 +7,9 @@ from planted_sequences import sequence_case
 
 from torchblur.filters import get_filter
 from tuning.config.fit import ObjectiveSpec
-from tuning.distributed_problem import Shard, ShardedProblem
 from tuning.objective.problem import Problem
 from tuning.objective.windows import make_samples
+from tuning.parallel.sharded_problem import Shard, ShardedProblem
 
 NAMES = ("kappa", "third_gain")
 

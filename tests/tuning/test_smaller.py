@@ -9,17 +9,17 @@ from planted_sequences import sequence_case
 
 from torchblur.filters import get_filter
 from torchblur.params import build
-from tuning.cluster_problem import ClusterProblem
 from tuning.config.data import Crops
 from tuning.config.fit import ObjectiveSpec, TuneConfig, resolve
 from tuning.config.methods import PruningSpec
-from tuning.distributed_problem import Shard, ShardedProblem
 from tuning.fidelity import Ladder, rung_sizes
 from tuning.objective.batches import FrameGroup
 from tuning.objective.cropping import pixels_of, smaller
 from tuning.objective.prepare import prepare
 from tuning.objective.problem import Problem
 from tuning.objective.windows import make_samples
+from tuning.parallel.cluster_problem import ClusterProblem
+from tuning.parallel.sharded_problem import Shard, ShardedProblem
 
 
 def windows(crops=None, seeds=(1, 2, 3, 4)):
@@ -167,7 +167,7 @@ def _each(problem, values):
 
 def test_parts_on_the_workers_of_a_cluster(planted_folders, monkeypatch):
     """A worker cuts the same parts out of the windows that it has loaded itself."""
-    monkeypatch.setattr("tuning.cluster_problem.share_cores", lambda: None)
+    monkeypatch.setattr("tuning.parallel.cluster_problem.share_cores", lambda: None)
     config = resolve(build(TuneConfig, planted_folders))
     problem = prepare(config).problem
     here = type("Here", (), {"map": lambda self, work, items: [work(item) for item in items]})()

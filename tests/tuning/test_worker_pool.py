@@ -10,11 +10,13 @@ from pathlib import Path
 import pytest
 import torch
 
-from tuning.worker_pool import worker_pool
+from tuning.parallel.cores import count_cores
+from tuning.parallel.processes import worker_pool
 
 DRIVER = """
 import os, time
-from tuning.worker_pool import worker_pool
+from tuning.parallel.cores import count_cores
+from tuning.parallel.processes import worker_pool
 
 if __name__ == "__main__":
     with worker_pool(2) as pool:
@@ -50,4 +52,4 @@ def test_a_killed_driver_leaves_no_workers(tmp_path):
 @pytest.mark.slow
 def test_workers_share_the_cores():
     with worker_pool(2) as pool:
-        assert pool.submit(torch.get_num_threads).result() == max(1, os.cpu_count() // 2)
+        assert pool.submit(torch.get_num_threads).result() == max(1, count_cores() // 2)

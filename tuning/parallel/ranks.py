@@ -21,11 +21,11 @@ from torch import Tensor
 
 from torchblur.errors import TorchblurError
 from torchblur.params import build
-from tuning.cluster import ClusterError
 from tuning.config.fit import TuneConfig
-from tuning.distributed_problem import Request, Shard, ShardedProblem
 from tuning.objective.prepare import fingerprint, is_same_data, prepare
 from tuning.objective.problem import Problem
+from tuning.parallel.cluster import ClusterError
+from tuning.parallel.sharded_problem import Request, Shard, ShardedProblem
 from tuning.results.fit import FitResult
 
 __all__ = ["RankZeroStoppedError", "Ranks", "is_restarted", "join_ranks", "rank_here"]

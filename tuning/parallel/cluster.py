@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any, Generic, TypeVar
 import torch
 
 from torchblur.errors import TorchblurError
-from tuning.runner import cores
+from tuning.parallel.cores import count_cores
 
 if TYPE_CHECKING:
     import distributed
@@ -236,7 +236,7 @@ def here() -> str:
 def share_cores() -> None:
     """Let torch use this task's share of its worker's cores: all of them by its threads."""
     worker = _load_dask().get_worker()
-    share = max(1, cores() // worker.state.nthreads)
+    share = max(1, count_cores() // worker.state.nthreads)
     if torch.get_num_threads() > share:
         torch.set_num_threads(share)
 
@@ -281,7 +281,7 @@ async def _knock(dask: Any, scheduler: str) -> None:
 
 
 def _start_local(dask: Any, workers: int) -> Any:
-    threads = str(max(1, cores() // workers))
+    threads = str(max(1, count_cores() // workers))
     return dask.LocalCluster(
         n_workers=workers,
         threads_per_worker=1,

@@ -9,6 +9,8 @@ from concurrent.futures import ProcessPoolExecutor
 
 import torch
 
+from tuning.parallel.cores import count_cores
+
 __all__ = ["worker_pool"]
 
 
@@ -18,7 +20,7 @@ def worker_pool(workers: int) -> ProcessPoolExecutor:
     Args:
         workers: How many.
     """
-    threads = max(1, (os.cpu_count() or 1) // workers)
+    threads = max(1, count_cores() // workers)
     return ProcessPoolExecutor(workers, multiprocessing.get_context("spawn"), _begin, (threads,))
 
 

@@ -19,10 +19,10 @@ from typing import Any, TypeVar
 
 from torchblur.errors import TorchblurError
 from torchblur.params import build
-from tuning.cluster import Cluster, ClusterError, here, share_cores
 from tuning.config.fit import TuneConfig
 from tuning.objective.prepare import fingerprint, is_same_data, prepare
 from tuning.objective.problem import Problem
+from tuning.parallel.cluster import Cluster, ClusterError, here, share_cores
 
 __all__ = ["ClusterProblem"]
 
