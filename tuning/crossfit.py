@@ -29,7 +29,7 @@ from tuning.data.loading import load_cases
 from tuning.data.variants import Variant, cut_of
 from tuning.files.outputs import make_folders
 from tuning.files.run_folder import open_run
-from tuning.methods import run_methods
+from tuning.methods.run import run_methods
 from tuning.objective.prepare import fit_device, prepare
 from tuning.parallel.processes import worker_pool
 from tuning.progress import Progress, Stage

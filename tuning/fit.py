@@ -22,7 +22,7 @@ from tuning.data.cases import AnyCase, SequenceCase
 from tuning.data.variants import Variant
 from tuning.evidence import evidence_of
 from tuning.files.run_folder import RunFolder, open_run
-from tuning.methods import run_methods
+from tuning.methods.run import run_methods
 from tuning.objective.prepare import fit_device, prepare
 from tuning.objective.problem import Problem
 from tuning.objective.sensitivity import measure_sensitivity

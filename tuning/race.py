@@ -24,7 +24,7 @@ from tuning.config.methods import GradientMethod
 from tuning.data.cases import AnyCase, Case
 from tuning.data.variants import Variant, render
 from tuning.files.run_folder import RunFolder, open_run
-from tuning.methods import run_methods
+from tuning.methods.run import run_methods
 from tuning.objective.prepare import prepare
 from tuning.objective.problem import Problem
 from tuning.objective.space import Space

@@ -29,7 +29,7 @@ from tuning.config.fit import TuneConfig, resolve
 from tuning.data.cases import AnyCase, SequenceCase
 from tuning.data.loading import load_cases
 from tuning.data.variants import Variant, render, render_frames
-from tuning.methods import method_name
+from tuning.methods.run import method_name
 from tuning.objective.prepare import fit_device
 from tuning.progress import Progress, ProgressEvent
 from tuning.results.fit import FitResult

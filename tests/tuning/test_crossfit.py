@@ -13,7 +13,7 @@ from tiny_shots import box_blur, moving_square
 from typer.testing import CliRunner
 
 import tuning.crossfit
-import tuning.gradient_state
+import tuning.methods.gradient_state
 from torchblur.errors import ConfigError
 from torchblur.filters import get_filter
 from torchblur.frame import Shutter
@@ -407,14 +407,14 @@ class TestTargets:
 
 class TestResume:
     def test_stopped_within_a_fit(self, finished, tmp_path, monkeypatch):
-        count, advance = iter(range(1000)), tuning.gradient_state.AdamState.advance
+        count, advance = iter(range(1000)), tuning.methods.gradient_state.AdamState.advance
 
         def interrupted(state, problem):
             if next(count) == 4:  # in the second fit
                 raise KeyboardInterrupt
             return advance(state, problem)
 
-        monkeypatch.setattr(tuning.gradient_state.AdamState, "advance", interrupted)
+        monkeypatch.setattr(tuning.methods.gradient_state.AdamState, "advance", interrupted)
         with pytest.raises(KeyboardInterrupt):
             run_crossfit(finished.config, tmp_path)
         assert len(list(tmp_path.glob("folds/*/fold.json"))) == 1

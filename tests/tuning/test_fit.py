@@ -6,18 +6,18 @@ import pytest
 import torch
 from planted import PLANTED, write_planted
 
-import tuning.gradient_state
+import tuning.methods.gradient_state
 import tuning.objective.batches
 from torchblur.errors import ConfigError, OutputError
 from torchblur.io import load_yaml, read_frame, read_image
 from torchblur.metrics import psnr
 from torchblur.params import build
 from torchblur.presets import create_filter, load_preset
-from tuning.blackbox import BlackBoxJob, fit_blackbox
 from tuning.config.fit import BlackBoxMethod, FilterSpec, GradientMethod, TuneConfig
 from tuning.data.blurring import blurred
 from tuning.fit import run_fit
-from tuning.gradient import FitError, GradientJob, fit_gradient
+from tuning.methods.blackbox import BlackBoxJob, fit_blackbox
+from tuning.methods.gradient import FitError, GradientJob, fit_gradient
 from tuning.objective.sensitivity import sensitivities
 from tuning.objective.space import make_space
 from tuning.results.fit import FitResult
@@ -110,7 +110,7 @@ class TestRecovery:
     def test_points_do_not_get_lost_outside_the_cube(self, planted_problem):
         """Outside, where the range is clamped, there is no gradient that leads back."""
         job = gradient_job(space_of({"third_gain": {"high": 3.0}}), starts=3, learning_rate=1.0)
-        state = tuning.gradient_state.AdamState(job)
+        state = tuning.methods.gradient_state.AdamState(job)
         for _ in range(3):
             state.advance(planted_problem)
             assert bool(((state.unit >= 0) & (state.unit <= 1)).all())

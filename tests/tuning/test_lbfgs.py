@@ -14,9 +14,9 @@ from torchblur.params import build
 from tuning.config.fit import FilterSpec, TuneConfig, resolve
 from tuning.config.methods import GradientMethod
 from tuning.files.run_folder import RunFolder
-from tuning.gradient import FitError, GradientJob, fit_gradient
-from tuning.gradient_state import losses_and_slopes
-from tuning.lbfgs import LbfgsState
+from tuning.methods.gradient import FitError, GradientJob, fit_gradient
+from tuning.methods.gradient_state import losses_and_slopes
+from tuning.methods.lbfgs import LbfgsState
 from tuning.objective.batches import FrameGroup
 from tuning.objective.problem import Problem
 from tuning.objective.space import make_space
@@ -144,7 +144,7 @@ def test_a_hole_in_the_objective(planted_problem, monkeypatch):
             third = job.space.from_unit(points)["third_gain"]
             return torch.where(bad(third), torch.nan, losses), slopes
 
-        monkeypatch.setattr("tuning.lbfgs.losses_and_slopes", broken)
+        monkeypatch.setattr("tuning.methods.lbfgs.losses_and_slopes", broken)
         fixed = {"kappa": 3.0, "direction_exponent": 2.5}
         job = job_of({"third_gain": {"high": 10}}, fixed, steps=10, starts=2)
         result = fit_gradient(planted_problem, job)
@@ -154,7 +154,7 @@ def test_a_hole_in_the_objective(planted_problem, monkeypatch):
     assert result.params["third_gain"] == pytest.approx(5.0, rel=0.02)
 
     monkeypatch.setattr(
-        "tuning.lbfgs.losses_and_slopes",
+        "tuning.methods.lbfgs.losses_and_slopes",
         lambda problem, job, points: (torch.full((1,), torch.nan), torch.zeros_like(points)),
     )
     with pytest.raises(FitError, match=r"no start has a finite loss at step 0; losses \[nan, nan"):

@@ -15,12 +15,12 @@ from torchblur.render import draw_scene, load_family
 from tuning.config.fit import TuneConfig, resolve
 from tuning.config.objective import ObjectiveSpec
 from tuning.fit import run_fit
+from tuning.methods.scene_pool import Pool
 from tuning.objective.batches import FrameGroup, SequenceGroup, join
 from tuning.objective.cpu_time import Meter
 from tuning.objective.prepare import prepare
 from tuning.objective.windows import make_samples
 from tuning.parallel.sharded_problem import ShardedProblem
-from tuning.pool import Pool
 from tuning.race_config import load_race_config
 
 CONFIGS = Path(__file__).parents[2] / "configs"

@@ -175,14 +175,14 @@ class TestRun:
 
 class TestResume:
     def test_stopped_within_a_fit(self, finished, tmp_path, monkeypatch):
-        count, advance = iter(range(1000)), tuning.gradient_state.AdamState.advance
+        count, advance = iter(range(1000)), tuning.methods.gradient_state.AdamState.advance
 
         def interrupted(state, problem):
             if next(count) == 17:  # in the second fit
                 raise KeyboardInterrupt
             return advance(state, problem)
 
-        monkeypatch.setattr(tuning.gradient_state.AdamState, "advance", interrupted)
+        monkeypatch.setattr(tuning.methods.gradient_state.AdamState, "advance", interrupted)
         with pytest.raises(KeyboardInterrupt):
             run_race(finished.config, tmp_path)
         assert next(count) == 18

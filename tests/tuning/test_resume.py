@@ -14,10 +14,10 @@ import tuning.fit
 from torchblur.errors import OutputError
 from torchblur.io import save_yaml
 from torchblur.params import build
-from tuning.blackbox import BlackBoxJob, fit_blackbox
 from tuning.config.fit import BlackBoxMethod, FilterSpec, TuneConfig, load_tune_config
 from tuning.files.run_folder import RunFolder, open_run, trim_torn_line
 from tuning.fit import run_fit
+from tuning.methods.blackbox import BlackBoxJob, fit_blackbox
 from tuning.objective.space import make_space
 
 RUN = """
@@ -105,7 +105,7 @@ def _run_until(wanted, folder):
 
 def test_interrupt_leaves_a_run_that_goes_on(config, tmp_path, whole, monkeypatch):
     calls = []
-    advance = tuning.gradient_state.AdamState.advance
+    advance = tuning.methods.gradient_state.AdamState.advance
 
     def interrupted(state, problem):
         calls.append(state.step)
@@ -113,7 +113,7 @@ def test_interrupt_leaves_a_run_that_goes_on(config, tmp_path, whole, monkeypatc
             raise KeyboardInterrupt
         return advance(state, problem)
 
-    monkeypatch.setattr(tuning.gradient_state.AdamState, "advance", interrupted)
+    monkeypatch.setattr(tuning.methods.gradient_state.AdamState, "advance", interrupted)
     with pytest.raises(KeyboardInterrupt):
         run_fit(config, tmp_path / "run")
     resumed = run_fit(config, tmp_path / "run", resume=True)

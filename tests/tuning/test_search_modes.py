@@ -9,24 +9,24 @@ import pytest
 import torch
 from planted import FIXED, PLANTED, planted_case
 
-import tuning.blackbox
+import tuning.methods.blackbox
 from torchblur.errors import ConfigError
 from torchblur.filters import get_filter
 from torchblur.params import build
-from tuning.blackbox import BlackBoxJob, fit_blackbox
-from tuning.blackbox_study import Journal
 from tuning.config.fit import FilterSpec, TuneConfig, resolve
 from tuning.config.methods import BlackBoxMethod, PruningSpec
 from tuning.config.objective import ObjectiveSpec
-from tuning.fidelity import Ladder, rung_sizes
 from tuning.files.run_folder import RunFolder
 from tuning.fit import run_fit
+from tuning.methods.blackbox import BlackBoxJob, fit_blackbox
+from tuning.methods.polish import is_promising
+from tuning.methods.pruning import Ladder, rung_sizes
+from tuning.methods.search import Journal
 from tuning.objective.batches import FrameGroup
 from tuning.objective.candidates import evaluate_candidates
 from tuning.objective.problem import Problem
 from tuning.objective.space import make_space
 from tuning.objective.windows import make_samples
-from tuning.polish import is_promising
 
 FREE = {
     "kappa": {"low": 1, "high": 50}, "third_gain": {"high": 10},
@@ -213,9 +213,10 @@ class TestPruning:
         _, log = logged(problem, tmp_path / "run", job)
         seeds = []
         monkeypatch.setattr(
-            "tuning.blackbox.Ladder", lambda p, s, seed: seeds.append(seed) or Ladder(p, s, seed)
+            "tuning.methods.blackbox.Ladder",
+            lambda p, s, seed: seeds.append(seed) or Ladder(p, s, seed),
         )
-        tuning.blackbox._Search(problem, job)
+        tuning.methods.blackbox._Search(problem, job)
         order = Ladder(problem, PruningSpec(), seeds[0]).order
         pruned = [line for line in log if "pruned" in line]
         assert len(pruned) > 4

@@ -15,13 +15,13 @@ from torchblur.filters import get_filter
 from torchblur.metrics import flip_ldr, temporal_errors
 from torchblur.metrics.pooling import weighted_median
 from torchblur.params import build
-from tuning.blackbox import BlackBoxJob, fit_blackbox
 from tuning.config.data import Crops
 from tuning.config.fit import BlackBoxMethod, FilterSpec, GradientMethod, ObjectiveSpec, TuneConfig
 from tuning.data.blurring import arguments, blurred_sequence
 from tuning.data.variants import Variant
 from tuning.fit import run_fit
-from tuning.gradient import FitError, GradientJob, fit_gradient
+from tuning.methods.blackbox import BlackBoxJob, fit_blackbox
+from tuning.methods.gradient import FitError, GradientJob, fit_gradient
 from tuning.objective.problem import Problem
 from tuning.objective.space import make_space
 from tuning.objective.windows import make_samples

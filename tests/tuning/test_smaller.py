@@ -12,7 +12,7 @@ from torchblur.params import build
 from tuning.config.data import Crops
 from tuning.config.fit import ObjectiveSpec, TuneConfig, resolve
 from tuning.config.methods import PruningSpec
-from tuning.fidelity import Ladder, rung_sizes
+from tuning.methods.pruning import Ladder, rung_sizes
 from tuning.objective.batches import FrameGroup
 from tuning.objective.cropping import pixels_of, smaller
 from tuning.objective.prepare import prepare

@@ -21,18 +21,17 @@ import optuna
 import torch
 from optuna.trial import FrozenTrial, Trial, TrialState, create_trial
 
-from tuning.blackbox_study import make_pruner, make_sampler, new_study, suggest
 from tuning.config.methods import BlackBoxMethod
-from tuning.fidelity import Climb, Ladder
 from tuning.files.run_folder import RunFolder
-from tuning.gradient import FitError, seed_of
-from tuning.job import MethodJob
+from tuning.methods.gradient import FitError, seed_of
+from tuning.methods.job import MethodJob
+from tuning.methods.polish import Polished, PolishStart, is_promising, polish
+from tuning.methods.pruning import Climb, Ladder
+from tuning.methods.search import make_pruner, make_sampler, new_study, run_rounds, suggest
 from tuning.objective.candidates import evaluate_candidates
 from tuning.objective.problem import Problem
-from tuning.polish import Polished, PolishStart, is_promising, polish
 from tuning.progress import Progress
 from tuning.results.fit import MethodResult
-from tuning.rounds import run_rounds
 
 __all__ = ["BlackBoxJob", "fit_blackbox"]
 

@@ -6,15 +6,15 @@ from typing import Any
 
 from torchblur.filters import get_filter
 from torchblur.params import declared
-from tuning.blackbox import BlackBoxJob, fit_blackbox
 from tuning.config.fit import TuneConfig, free_names
 from tuning.config.methods import GradientMethod, ParetoMethod, polished_names
 from tuning.files.run_folder import RunFolder
-from tuning.gradient import GradientJob, fit_gradient, seed_of
+from tuning.methods.blackbox import BlackBoxJob, fit_blackbox
+from tuning.methods.gradient import GradientJob, fit_gradient, seed_of
+from tuning.methods.pareto import ParetoJob, fit_pareto
+from tuning.methods.scene_pool import Pool
 from tuning.objective.problem import Problem
 from tuning.objective.space import Space
-from tuning.pareto import ParetoJob, fit_pareto
-from tuning.pool import Pool
 from tuning.progress import Progress
 from tuning.results.fit import MethodResult
 

@@ -13,7 +13,7 @@ import time
 from typing import Any
 
 from tuning.files.run_folder import RunFolder
-from tuning.gradient_state import (
+from tuning.methods.gradient_state import (
     AdamState,
     FitError,
     GradientJob,
@@ -22,9 +22,9 @@ from tuning.gradient_state import (
     scalars,
     seed_of,
 )
-from tuning.lbfgs import LbfgsState
+from tuning.methods.lbfgs import LbfgsState
+from tuning.methods.scene_pool import Pool
 from tuning.objective.problem import Problem
-from tuning.pool import Pool
 from tuning.progress import Progress, Stage
 from tuning.results.fit import MethodResult, StartResult
 

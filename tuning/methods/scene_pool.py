@@ -23,7 +23,7 @@ from tuning.config.data import DataSpec, FamilyData, FamilyStreamData
 from tuning.config.methods import RefreshSpec
 from tuning.data.cases import AnyCase
 from tuning.data.loading import draw_cases
-from tuning.gradient_state import seed_of
+from tuning.methods.gradient_state import seed_of
 from tuning.objective.problem import Problem
 from tuning.objective.windows import AnySample, make_samples
 from tuning.parallel.sharded_problem import ShardedProblem

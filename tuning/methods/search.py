@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import math
 import warnings
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import optuna
 from optuna.pruners import (
@@ -22,13 +23,15 @@ from optuna.pruners import (
 from optuna.samplers import BaseSampler, CmaEsSampler, GPSampler, RandomSampler, TPESampler
 from optuna.storages import InMemoryStorage, JournalStorage
 from optuna.storages.journal import JournalFileBackend
-from optuna.trial import FrozenTrial, Trial
+from optuna.trial import FrozenTrial, Trial, TrialState
 
 from tuning.config.methods import BlackBoxMethod
 from tuning.files.run_folder import RunFolder, trim_torn_line
+from tuning.methods.job import MethodJob
 from tuning.objective.space import FreeParameter
+from tuning.progress import Progress, Stage
 
-__all__ = ["Journal", "make_pruner", "make_sampler", "new_study", "suggest"]
+__all__ = ["Journal", "Search", "make_pruner", "make_sampler", "new_study", "run_rounds", "suggest"]
 
 _NAME = "fit"  # Hyperband draws a trial's bracket from the study's name
 _END = "round_end"
@@ -166,3 +169,63 @@ def _rewritten(path: Path, trials: list[FrozenTrial], objectives: int) -> optuna
 
 def _remove_lock(path: Path) -> None:
     path.with_name(f"{path.name}.lock").unlink(missing_ok=True)
+
+
+class Search(Protocol):
+    """A study in memory that goes on by rounds."""
+
+    study: optuna.Study
+
+    @property
+    def drawn(self) -> int:
+        """How many trials the sampler drew."""
+
+    @property
+    def best(self) -> float | None:
+        """The least loss so far."""
+
+    def round(self) -> list[FrozenTrial]:
+        """Draw, evaluate and tell; return the finished trials in order."""
+
+
+def run_rounds(
+    search: Search,
+    job: MethodJob,
+    trials: int,
+    record: Callable[[FrozenTrial], dict[str, Any]],
+    folder: RunFolder | None = None,
+    progress: Progress | None = None,
+) -> None:
+    """Go on with a search until it has drawn all of its trials.
+
+    Args:
+        search: An empty search; what the journal has joins it first.
+        job: Whose journal and log lines these are.
+        trials: How many are drawn.
+        record: Returns what is logged of a trial.
+        folder: Where the journal and the log go; a journal that is there is gone on from.
+        progress: Who is told of each round.
+    """
+    journal = None
+    if folder is not None:
+        journal = Journal(folder, job.index, len(search.study.directions))
+        for trial in journal.trials():
+            search.study.add_trial(trial)
+        known = search.study.trials
+        logged = folder.drop_records(job.index, len(known))
+        for trial in known:
+            if trial.number not in logged:
+                _log(folder, job, record(trial))
+    stage = Stage(job.name, trials, progress, done=search.drawn)
+    while search.drawn < trials:
+        found = search.round()
+        for position, trial in enumerate(found):
+            if folder is not None and journal is not None:
+                journal.add(trial, ends_round=position == len(found) - 1)
+                _log(folder, job, record(trial))
+        last = [t.values[0] for t in found if t.state == TrialState.COMPLETE and t.values]
+        stage.step(search.drawn, loss=min(last, default=None), best=search.best)
+
+
+def _log(folder: RunFolder, job: MethodJob, record: dict[str, Any]) -> None:
+    folder.log(method=job.index, **record)

@@ -20,20 +20,19 @@ import optuna
 from optuna.samplers import BaseSampler, NSGAIISampler, TPESampler
 from optuna.trial import FrozenTrial, Trial, TrialState, create_trial
 
-from tuning.blackbox_study import new_study, suggest
 from tuning.config.cost import cost_at
 from tuning.config.methods import ParetoMethod
 from tuning.files.run_folder import RunFolder
-from tuning.gradient import FitError, seed_of
-from tuning.job import MethodJob
+from tuning.methods.gradient import FitError, seed_of
+from tuning.methods.job import MethodJob
+from tuning.methods.polish import Polished, PolishStart, polish
+from tuning.methods.search import new_study, run_rounds, suggest
 from tuning.objective.candidates import evaluate_candidates
 from tuning.objective.problem import Problem
 from tuning.objective.space import FreeParameter
-from tuning.polish import Polished, PolishStart, polish
 from tuning.progress import Progress, Stage
 from tuning.results.fit import MethodResult
 from tuning.results.front import ParetoPoint, ParetoResult, front_of, make_point, pick
-from tuning.rounds import run_rounds
 
 __all__ = ["ParetoJob", "fit_pareto"]
 

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from torchblur.errors import TorchblurError
 from tuning.config.fit import GradientMethod
-from tuning.job import MethodJob
+from tuning.methods.job import MethodJob
 from tuning.objective.problem import Problem
 from tuning.objective.space import Space
 

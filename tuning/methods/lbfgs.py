@@ -16,7 +16,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from tuning.gradient_state import GradientJob, State, losses_and_slopes
+from tuning.methods.gradient_state import GradientJob, State, losses_and_slopes
 from tuning.objective.problem import Problem
 
 __all__ = ["LbfgsState"]
