@@ -18,7 +18,7 @@ from typing import IO, Any
 
 from torchblur.errors import ConfigError, OutputError
 from torchblur.params import Config
-from tuning.apply import device_named
+from tuning.batch.apply import device_named
 from tuning.bench_cases import Case, Report, Row, Table
 from tuning.bench_child import MARK, BenchJob
 from tuning.bench_machine import busy_warning, describe_machine, watch

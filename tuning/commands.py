@@ -239,7 +239,7 @@ def filter_(  # noqa: PLR0913 - each argument is an option
     among them, and: layers=[NAME, ...] to write more than color, overrides.FIELD for what differs
     from the convention (velocity_scale, velocity_y ...), on_invalid=mask, half, engine, device.
     """
-    from tuning.filtering import filter_files, load_settings, plan_files
+    from tuning.batch.single import filter_files, load_settings, plan_files
 
     settings = load_settings(filter_name, set_ or [], convention)
     jobs = plan_files(inputs, output, gbuffer=gbuffer, reference=reference, overwrite=overwrite)
@@ -272,7 +272,7 @@ def batch(
     scheduler: Scheduler = None,
 ) -> None:
     """Filter many frames; what is done is skipped, so a stopped run goes on when started again."""
-    from tuning.batch import load_batch_config, plan_batch, run_batch
+    from tuning.batch.run import load_batch_config, plan_batch, run_batch
     from tuning.printing import print_batch, print_plan
 
     overrides = [*(set_ or []), *([f"workers={workers}"] if workers is not None else [])]

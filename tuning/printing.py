@@ -18,7 +18,7 @@ from torchblur.io.inspect import ChannelInfo
 from torchblur.params import Param, choices, declared
 from tuning.ablation import AblationConfig, Measured
 from tuning.ablation_files import RULE, tally
-from tuning.batch import BatchResult, Plan
+from tuning.batch.run import BatchResult, Plan
 from tuning.console import (
     log,
     metrics_table,

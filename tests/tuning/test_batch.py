@@ -12,11 +12,11 @@ import torch
 from tiny_shots import moving_square, truncate, with_nan_velocity, write_shot
 from typer.testing import CliRunner
 
-import tuning.runner
+import tuning.batch.threads
 from torchblur.errors import ConfigError, FileFormatError, OutputError
 from torchblur.io import read_channels, read_exr, read_frame, read_image, save_yaml, write_frame
 from torchblur.presets import Preset, create_filter, save_preset
-from tuning.batch import BatchConfig, load_batch_config, plan_batch, run_batch
+from tuning.batch.run import BatchConfig, load_batch_config, plan_batch, run_batch
 from tuning.commands import app
 
 
@@ -68,14 +68,14 @@ class TestResults:
 
     def test_torch_threads_are_shared_and_given_back(self, shot, monkeypatch):
         seen = []
-        original = tuning.runner.blur_frame
+        original = tuning.batch.threads.blur_frame
 
         def watched(*args):
             seen.append(torch.get_num_threads())
             return original(*args)
 
-        monkeypatch.setattr(tuning.runner, "blur_frame", watched)
-        monkeypatch.setattr(tuning.runner, "count_cores", lambda: 4)
+        monkeypatch.setattr(tuning.batch.threads, "blur_frame", watched)
+        monkeypatch.setattr(tuning.batch.threads, "count_cores", lambda: 4)
         before = torch.get_num_threads()
         torch.set_num_threads(4)
         try:
@@ -87,7 +87,7 @@ class TestResults:
 
     def test_frames_are_read_ahead_but_not_all_at_once(self, shot, monkeypatch):
         reading, most = [0], [0]
-        read, blur = tuning.runner.read_samples, tuning.runner.blur_frame
+        read, blur = tuning.batch.threads.read_samples, tuning.batch.threads.blur_frame
 
         def counted_read(*args):
             reading[0] += 1
@@ -99,8 +99,8 @@ class TestResults:
             reading[0] -= 1
             return blur(*args)
 
-        monkeypatch.setattr(tuning.runner, "read_samples", counted_read)
-        monkeypatch.setattr(tuning.runner, "blur_frame", slow_blur)
+        monkeypatch.setattr(tuning.batch.threads, "read_samples", counted_read)
+        monkeypatch.setattr(tuning.batch.threads, "blur_frame", slow_blur)
         batch(config_for(write_shot(shot[0].parent / "long", 8), workers=1, prefetch=2))
         assert most[0] == 3
 
@@ -383,12 +383,12 @@ class TestStopping:
 import signal, sys, time
 # A shell starts its background jobs with SIGINT ignored, and so these tests when it runs them.
 signal.signal(signal.SIGINT, signal.default_int_handler)
-import tuning.runner
-original = tuning.runner.blur_frame
+import tuning.batch.threads
+original = tuning.batch.threads.blur_frame
 def slow(*args):
     time.sleep(0.4)
     return original(*args)
-tuning.runner.blur_frame = slow
+tuning.batch.threads.blur_frame = slow
 from tuning.cli import main
 main()
 """
@@ -452,7 +452,7 @@ main()
 
     def test_a_second_ctrl_c_drops_the_frames_in_flight(self, shot, monkeypatch):
         filtering, go_on = threading.Event(), threading.Event()
-        original, waited = tuning.runner.blur_frame, []
+        original, waited = tuning.batch.threads.blur_frame, []
 
         def held(*args):
             filtering.set()
@@ -468,9 +468,9 @@ main()
                 raise KeyboardInterrupt
             return real_wait(running, **kwargs)
 
-        real_wait = tuning.runner.wait
-        monkeypatch.setattr(tuning.runner, "blur_frame", held)
-        monkeypatch.setattr(tuning.runner, "wait", interrupted)
+        real_wait = tuning.batch.threads.wait
+        monkeypatch.setattr(tuning.batch.threads, "blur_frame", held)
+        monkeypatch.setattr(tuning.batch.threads, "wait", interrupted)
         _, result = batch(config_for(shot))
         assert result.interrupted
         assert result.written == []

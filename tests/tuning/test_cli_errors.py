@@ -284,12 +284,12 @@ class TestDebug:
         assert type(result.exception).__name__ == "ConfigError"
 
     def test_defects_are_one_message_too(self, shot, tmp_path, monkeypatch):
-        import tuning.filtering
+        import tuning.batch.single
 
         def broken(*args, **kwargs):
             raise RuntimeError("the tensors disagree")
 
-        monkeypatch.setattr(tuning.filtering, "filter_files", broken)
+        monkeypatch.setattr(tuning.batch.single, "filter_files", broken)
         result = CliRunner().invoke(
             app, ["filter", "line", str(shot[0]), "-o", str(tmp_path / "o")]
         )
@@ -300,13 +300,13 @@ class TestDebug:
     def test_warnings_are_one_line(self, shot, tmp_path, monkeypatch):
         import warnings
 
-        import tuning.filtering
+        import tuning.batch.single
 
         def warning(*args, **kwargs):
             warnings.simplefilter("always")
             warnings.warn("something is odd", stacklevel=1)
 
-        monkeypatch.setattr(tuning.filtering, "filter_files", warning)
+        monkeypatch.setattr(tuning.batch.single, "filter_files", warning)
         result = CliRunner().invoke(
             app, ["filter", "line", str(shot[0]), "-o", str(tmp_path / "o")]
         )
@@ -316,7 +316,7 @@ class TestDebug:
     def test_what_is_cut_is_told_once_for_each_filter(self, shot, tmp_path, monkeypatch):
         import warnings
 
-        import tuning.filtering
+        import tuning.batch.single
         from torchblur.errors import ReachWarning
 
         def cutting(*args, **kwargs):
@@ -324,7 +324,7 @@ class TestDebug:
             for text in ("tan2022: 5%", "tan2022: 6%", "sousa2013: 5%"):
                 warnings.warn(text, ReachWarning, stacklevel=1)
 
-        monkeypatch.setattr(tuning.filtering, "filter_files", cutting)
+        monkeypatch.setattr(tuning.batch.single, "filter_files", cutting)
         result = CliRunner().invoke(
             app, ["filter", "line", str(shot[0]), "-o", str(tmp_path / "o")]
         )

@@ -11,15 +11,15 @@ from planted_sequences import moving_sequence
 from tiny_shots import moving_square, truncate, with_nan_velocity, write_shot
 from typer.testing import CliRunner
 
-import tuning.cluster_batch
+import tuning.batch.cluster
 from torchblur.io import read_image, save_yaml, write_frame
 from torchblur.presets import Preset, save_preset
-from tuning.batch import BatchConfig, plan_batch, run_batch
-from tuning.cluster_batch import _collect, _make, _Order, _Told
+from tuning.batch.cluster import _collect, _make, _Order, _Told
+from tuning.batch.run import BatchConfig, plan_batch, run_batch
+from tuning.batch.threads import Task
 from tuning.commands import app
 from tuning.files.outputs import Job
 from tuning.parallel.cluster import ClusterError, Lost, open_cluster
-from tuning.runner import Task
 
 
 @pytest.fixture(scope="module")
@@ -130,8 +130,8 @@ class TestOtherDisks:
     def test_a_worker_that_does_not_see_the_results_folder_writes_nothing(
         self, tmp_path, monkeypatch
     ):
-        monkeypatch.setattr(tuning.cluster_batch, "here", lambda: "tcp://far:1")
-        monkeypatch.setattr(tuning.cluster_batch, "share_cores", lambda: None)
+        monkeypatch.setattr(tuning.batch.cluster, "here", lambda: "tcp://far:1")
+        monkeypatch.setattr(tuning.batch.cluster, "share_cores", lambda: None)
         shot = write_shot(tmp_path, 1)
         job = Job(shot[0], tmp_path / "out.exr")
         settings = '{"filter": "line"}'

@@ -14,16 +14,16 @@ from planted_sequences import Recall, moving_sequence
 from tiny_shots import truncate, with_nan_velocity
 from typer.testing import CliRunner
 
-import tuning.runner
+import tuning.batch.threads
 from torchblur.errors import ConfigError, FileFormatError, OutputError
 from torchblur.frame import Sequence
 from torchblur.io import read_frame, read_image, save_yaml, write_frame, write_image
 from torchblur.metrics import evaluate, temporal_errors
-from tuning.batch import BatchConfig, plan_batch, run_batch
+from tuning.batch.run import BatchConfig, plan_batch, run_batch
+from tuning.batch.single import filter_files, load_settings, plan_files
 from tuning.commands import app
 from tuning.files.frame_numbers import shots_of
 from tuning.files.outputs import Job
-from tuning.filtering import filter_files, load_settings, plan_files
 
 pytestmark = pytest.mark.usefixtures("recall")
 
@@ -229,13 +229,13 @@ class TestSecondRun:
         config = config_for(stream[0].parent)
         batch(config)
         (stream[0].parent / "out" / stream[2].name).unlink()
-        seen, original = [], tuning.runner.blur_step
+        seen, original = [], tuning.batch.threads.blur_step
 
         def watched(blur, samples, *args):
             seen.append(Path(samples[0].source).name)
             return original(blur, samples, *args)
 
-        monkeypatch.setattr(tuning.runner, "blur_step", watched)
+        monkeypatch.setattr(tuning.batch.threads, "blur_step", watched)
         batch(config)
         assert seen == [path.name for path in stream[:3]]
 
@@ -325,12 +325,12 @@ sys.path.insert(0, TESTS)
 import torchblur.filters.base
 from planted_sequences import Recall
 torchblur.filters.base._REGISTRY["recall"] = Recall
-import tuning.runner
-original = tuning.runner.blur_step
+import tuning.batch.threads
+original = tuning.batch.threads.blur_step
 def slow(*args):
     time.sleep(0.3)
     return original(*args)
-tuning.runner.blur_step = slow
+tuning.batch.threads.blur_step = slow
 from tuning.cli import main
 main()
 """

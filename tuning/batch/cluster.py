@@ -21,10 +21,10 @@ from torchblur.errors import OutputError
 from torchblur.filters import BlurFilter
 from torchblur.ops.compiling import compiler_works
 from torchblur.ops.gather import Engine
-from tuning.apply import FilterSettings, make_filter
+from tuning.batch.apply import FilterSettings, make_filter
+from tuning.batch.threads import Log, Runner, Task
 from tuning.files.outputs import Job
 from tuning.parallel.cluster import Cluster, ClusterError, Lost, here, share_cores
-from tuning.runner import Log, Runner, Task
 
 __all__ = ["run_on_cluster"]
 

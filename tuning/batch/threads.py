@@ -20,7 +20,7 @@ from torchblur.filters import BlurFilter
 from torchblur.filters.base import History, TemporalBlur
 from torchblur.frame import Frame
 from torchblur.ops.compiling import compiler_works
-from tuning.apply import FilterSettings, blur_frame, blur_step, read_samples, write_job
+from tuning.batch.apply import FilterSettings, blur_frame, blur_step, read_samples, write_job
 from tuning.files.outputs import Job
 from tuning.parallel.cores import count_cores
 

@@ -21,8 +21,9 @@ from torchblur.errors import ConfigError, OutputError
 from torchblur.filters.base import TemporalBlur
 from torchblur.io import load_yaml
 from torchblur.params import build
-from tuning.apply import FilterSettings, make_filter, recipe_of, samples_beside
-from tuning.cluster_batch import run_on_cluster
+from tuning.batch.apply import FilterSettings, make_filter, recipe_of, samples_beside
+from tuning.batch.cluster import run_on_cluster
+from tuning.batch.threads import Runner, Task
 from tuning.config.fit import apply_overrides
 from tuning.files.frame_numbers import shots_of
 from tuning.files.outputs import (
@@ -42,7 +43,6 @@ from tuning.objective.engine import files_engine
 from tuning.parallel.cluster import Cluster
 from tuning.parallel.cores import count_cores
 from tuning.progress import Progress, Stage
-from tuning.runner import Runner, Task
 
 __all__ = [
     "BatchConfig",

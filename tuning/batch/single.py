@@ -13,7 +13,7 @@ from torchblur.filters import BlurFilter
 from torchblur.filters.base import TemporalBlur
 from torchblur.frame import Frame
 from torchblur.params import build
-from tuning.apply import (
+from tuning.batch.apply import (
     FilterSettings,
     blur_frame,
     blur_step,
