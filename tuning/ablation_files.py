@@ -13,7 +13,7 @@ from torchblur.errors import OutputError
 from torchblur.io.paths import output_file
 from tuning.ablation import AblationConfig, Measured
 from tuning.files.outputs import make_folders
-from tuning.page import View, make_view, render_page
+from tuning.report.page import View, make_view, render_page
 
 __all__ = ["COLUMNS", "RULE", "cells", "check_outputs", "side_text", "tally", "write_ablation"]
 

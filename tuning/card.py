@@ -15,10 +15,10 @@ from torchblur.params import declared
 from torchblur.presets import Preset
 from tuning.config.data import DataItem
 from tuning.config.fit import TuneConfig
-from tuning.page import Row, Table
-from tuning.pareto_files import front_method
-from tuning.pareto_report import front_section
-from tuning.report import default_label, figures_tables
+from tuning.report.fit import default_label, figures_tables
+from tuning.report.front import front_section
+from tuning.report.front_files import front_method
+from tuning.report.page import Row, Table
 from tuning.results.fit import FitResult, ParameterResult, cut_text, worse_text
 from tuning.results.front import ParetoResult
 

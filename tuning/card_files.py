@@ -15,8 +15,8 @@ from tuning.card_picture import card_picture
 from tuning.config.fit import load_tune_config
 from tuning.data.cases import AnyCase
 from tuning.data.loading import load_cases
-from tuning.pareto_report import preset_names
 from tuning.progress import Progress, Stage
+from tuning.report.front import preset_names
 from tuning.results.fit import FitResult
 
 __all__ = ["write_cards"]

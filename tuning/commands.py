@@ -323,8 +323,8 @@ def compare(
     median of FLIP, and the error of the change from frame to frame.
     """
     from torchblur.frame import Shutter
-    from tuning.compare import compare_images, write_page
-    from tuning.compare_sequences import compare_sequences, is_sequence
+    from tuning.report.compare import compare_images, write_page
+    from tuning.report.compare_sequences import compare_sequences, is_sequence
 
     named = [*images, reference, *([] if frame is None else [frame])]
     compared = compare_sequences if is_sequence(named) else compare_images

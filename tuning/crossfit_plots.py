@@ -14,7 +14,7 @@ from torchblur.io.paths import output_file
 from tuning.crossfit import Crossfit
 from tuning.crossfit_config import CrossfitConfig
 from tuning.crossfit_summary import Row, final_variants, mean_names
-from tuning.plots import color_of, style
+from tuning.report.plots import color_of, style
 
 __all__ = ["plot_crossfit"]
 

@@ -20,7 +20,6 @@ from tuning.ceiling import ceiling
 from tuning.config.fit import GradientMethod, TuneConfig, resolve
 from tuning.data.cases import AnyCase, SequenceCase
 from tuning.data.variants import Variant
-from tuning.evidence import evidence_of
 from tuning.files.run_folder import RunFolder, open_run
 from tuning.methods.run import run_methods
 from tuning.objective.prepare import fit_device, prepare
@@ -30,10 +29,11 @@ from tuning.objective.space import Space
 from tuning.parallel.cluster import Cluster, ClusterError
 from tuning.parallel.cluster_problem import ClusterProblem
 from tuning.parallel.ranks import is_restarted, join_ranks
-from tuning.pareto_files import write_pareto
 from tuning.pareto_scores import budget_notes, judged
 from tuning.progress import Progress, ProgressEvent, Stage
-from tuning.report import write_report
+from tuning.report.evidence import evidence_of
+from tuning.report.fit import write_report
+from tuning.report.front_files import write_pareto
 from tuning.results.fit import (
     CaseScore,
     FitResult,

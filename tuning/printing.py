@@ -29,8 +29,8 @@ from tuning.console import (
     results,
 )
 from tuning.files.outputs import State
-from tuning.pareto_report import preset_names
 from tuning.reach_advice import SHUTTER, reach_advice
+from tuning.report.front import preset_names
 from tuning.results.fit import FitResult, cut_text, height_name
 
 __all__ = [

@@ -13,7 +13,7 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator
 
 from torchblur.io.paths import output_file
-from tuning.plots import color_of, style
+from tuning.report.plots import color_of, style
 from tuning.study import Row
 
 __all__ = ["plot_samples", "plot_time"]

@@ -15,11 +15,20 @@ from planted import planted_case, write_planted
 from torchblur.metrics import flip_ldr
 from torchblur.params import build
 from tuning.config.fit import ObjectiveSpec, TuneConfig
-from tuning.evidence import evidence_of
 from tuning.fit import run_fit
-from tuning.page import Column, Row, Table, error_map, image_uri, make_view, map_limit, render_page
 from tuning.printing import print_fit
-from tuning.report import figures_table, figures_tables, verdict_of
+from tuning.report.evidence import evidence_of
+from tuning.report.fit import figures_table, figures_tables, verdict_of
+from tuning.report.page import (
+    Column,
+    Row,
+    Table,
+    error_map,
+    image_uri,
+    make_view,
+    map_limit,
+    render_page,
+)
 from tuning.results.fit import CaseScore
 
 
@@ -109,7 +118,7 @@ class TestPieces:
         assert len(view.maps) == 2
 
     def test_names_are_escaped(self, run):
-        from tuning.page import _environment
+        from tuning.report.page import _environment
 
         template = _environment().from_string("{% import 'parts.html' as p %}{{ p.slider(view) }}")
         reference = torch.rand(1, 3, 12, 16)

@@ -14,8 +14,8 @@ from tuning.objective.sensitivity import (
     measure_sensitivity,
 )
 from tuning.objective.space import make_space
+from tuning.report.sensitivity import _is_misled
 from tuning.results.fit import SensitivityResult
-from tuning.sensitivity_rows import _is_misled
 
 START = dict(PLANTED, third_gain=8.0, kappa=12.0)
 

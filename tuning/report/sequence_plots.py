@@ -10,7 +10,7 @@ from markupsafe import Markup
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from tuning.plots import color_of, style, svg_of
+from tuning.report.plots import color_of, style, svg_of
 from tuning.results.fit import CaseScore, FrameScore
 
 __all__ = ["frame_curves", "score_curves"]

@@ -13,13 +13,13 @@ from torchblur.errors import ConfigError
 from torchblur.frame import Shutter
 from torchblur.io import read_frame
 from torchblur.metrics import border_band, prepare_flip_ldr
-from tuning.compare import Comparison, check_size, short_names
 from tuning.data.streams import shot_starts
 from tuning.files.frame_numbers import frame_numbers, numbered_file
 from tuning.files.images import read_color
+from tuning.report.compare import Comparison, check_size, short_names
+from tuning.report.sequence_plots import frame_curves
 from tuning.results.fit import FrameScore
 from tuning.scoring.sequences import FrameByFrame, finite_or_none
-from tuning.sequence_plots import frame_curves
 
 __all__ = ["compare_sequences", "is_sequence"]
 

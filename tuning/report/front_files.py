@@ -11,9 +11,9 @@ from torchblur.filters import get_filter
 from torchblur.presets import Preset, save_preset
 from tuning.config.fit import TuneConfig
 from tuning.data.cases import AnyCase
-from tuning.evidence import evidence_of
 from tuning.files.run_folder import RunFolder
-from tuning.pareto_plots import front_png
+from tuning.report.evidence import evidence_of
+from tuning.report.front_plots import front_png
 from tuning.results.fit import FitResult, MethodResult
 from tuning.results.front import ParetoPick, ParetoPoint, ParetoResult
 

@@ -17,9 +17,11 @@ from tuning.config.fit import TuneConfig
 from tuning.data.cases import AnyCase, SequenceCase
 from tuning.data.variants import Variant, render, render_frames
 from tuning.files.run_folder import RunFolder
-from tuning.page import Column, Row, Table, View, make_view, render_page
-from tuning.pareto_report import front_section, preset_names
-from tuning.plots import loss_curves, parameter_paths
+from tuning.report.front import front_section, preset_names
+from tuning.report.page import Column, Row, Table, View, make_view, render_page
+from tuning.report.plots import loss_curves, parameter_paths
+from tuning.report.sensitivity import slope_rows
+from tuning.report.sequence_plots import score_curves
 from tuning.results.fit import (
     CaseScore,
     FitResult,
@@ -29,8 +31,6 @@ from tuning.results.fit import (
     height_name,
     worse_text,
 )
-from tuning.sensitivity_rows import slope_rows
-from tuning.sequence_plots import score_curves
 
 __all__ = [
     "Verdict",

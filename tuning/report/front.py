@@ -7,9 +7,9 @@ from typing import Any
 
 from markupsafe import Markup
 
-from tuning.page import Column, Row, Table
-from tuning.pareto_files import front_method
-from tuning.pareto_plots import front_svg
+from tuning.report.front_files import front_method
+from tuning.report.front_plots import front_svg
+from tuning.report.page import Column, Row, Table
 from tuning.results.fit import FitResult
 from tuning.results.front import ParetoPoint, ParetoResult
 

@@ -11,7 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 
-from tuning.plots import color_of, style, svg_of
+from tuning.report.plots import color_of, style, svg_of
 from tuning.results.front import ParetoPoint, ParetoResult
 
 __all__ = ["front_png", "front_svg"]

@@ -1,7 +1,7 @@
 """Pieces of self-contained HTML pages: images as data URIs, sliders, error maps, tables.
 
 A page has no script but a few lines of its own, and asks the network for nothing. The templates
-lie in `tuning/templates`: `base.html` has the style and the script, `parts.html` the macros.
+lie in `tuning/report/templates`: `base.html` has the style and the script, `parts.html` the macros.
 """
 
 from __future__ import annotations
@@ -254,7 +254,7 @@ def render_page(template: str, **context: object) -> str:
     """Return a page.
 
     Args:
-        template: File in `tuning/templates`; it extends `base.html`.
+        template: File in `tuning/report/templates`; it extends `base.html`.
         **context: What the template names. Text is escaped; only `Markup` is not.
     """
     return _environment().get_template(template).render(**context)
@@ -263,7 +263,7 @@ def render_page(template: str, **context: object) -> str:
 @functools.lru_cache(maxsize=1)
 def _environment() -> Environment:
     environment = Environment(
-        loader=PackageLoader("tuning", "templates"),
+        loader=PackageLoader("tuning.report.fit", "templates"),
         autoescape=True,
         undefined=StrictUndefined,
         trim_blocks=True,

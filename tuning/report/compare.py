@@ -17,7 +17,7 @@ from torchblur.io import read_frame
 from torchblur.io.paths import output_file
 from torchblur.metrics import border_band, evaluate
 from tuning.files.images import read_color
-from tuning.page import Column, Row, Table, make_view, render_page
+from tuning.report.page import Column, Row, Table, make_view, render_page
 
 __all__ = ["Comparison", "check_size", "compare_images", "short_names", "write_page"]
 
