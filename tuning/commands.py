@@ -169,10 +169,10 @@ def tune(  # noqa: PLR0913 - each argument is an option
     (`population`); `torchrun -m tuning tune CONFIG` splits the windows of each step.
     """
     from tuning.config.fit import load_tune_config
-    from tuning.fit import run_fit
+    from tuning.fit.run import run_fit
+    from tuning.fit.tensorboard import tracking
     from tuning.parallel.ranks import RankZeroStoppedError, rank_here
     from tuning.printing import print_fit
-    from tuning.track import tracking
 
     overrides = [*(set_ or []), *([f"device={device}"] if device else [])]
     overrides += ["engine=eager"] if no_compile else []

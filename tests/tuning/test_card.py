@@ -20,7 +20,7 @@ from tuning.card_picture import card_picture
 from tuning.commands import app
 from tuning.config.fit import TuneConfig, load_tune_config
 from tuning.data.loading import load_cases
-from tuning.fit import run_fit
+from tuning.fit.run import run_fit
 from tuning.results.fit import CaseScore
 
 FIGURES = {"flip": 0.02, "psnr": 30.0, "ssim": 0.9}

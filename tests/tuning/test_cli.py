@@ -535,11 +535,11 @@ class TestTune:
         assert not (tmp_path / "run").exists()
 
     def test_ctrl_c_says_how_to_go_on(self, config, tmp_path, monkeypatch):
-        import tuning.fit
+        import tuning.fit.run
 
         def interrupted(*args, **kwargs):
             raise KeyboardInterrupt
 
-        monkeypatch.setattr(tuning.fit, "run_fit", interrupted)
+        monkeypatch.setattr(tuning.fit.run, "run_fit", interrupted)
         result = run("tune", config, "-o", tmp_path / "r", "--set", "seed=3", code=130)
         assert f"torchblur tune {config} -o {tmp_path / 'r'} --set seed=3 --resume" in result.stderr

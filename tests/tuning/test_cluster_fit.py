@@ -12,7 +12,7 @@ from planted import write_planted
 import tuning.parallel.cluster_problem
 from torchblur.params import build
 from tuning.config.fit import TuneConfig
-from tuning.fit import run_fit
+from tuning.fit.run import run_fit
 from tuning.objective.prepare import prepare
 from tuning.parallel.cluster import ClusterError, open_cluster
 from tuning.parallel.cluster_problem import ClusterProblem

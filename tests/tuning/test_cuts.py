@@ -16,7 +16,7 @@ from torchblur.presets import load_preset
 from tuning.card import Card, card_text
 from tuning.config.fit import TuneConfig, load_tune_config
 from tuning.data.variants import Variant, cut_of
-from tuning.fit import run_fit
+from tuning.fit.run import run_fit
 from tuning.printing import print_fit
 from tuning.results.cuts import Cuts, cuts_over
 from tuning.results.fit import CaseScore, FitResult, cut_text

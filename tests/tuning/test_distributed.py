@@ -17,7 +17,7 @@ from planted import planted_case, write_planted
 from torchblur.io import save_yaml, write_frame, write_image
 from torchblur.presets import load_preset
 from tuning.config.fit import load_tune_config
-from tuning.fit import run_fit
+from tuning.fit.run import run_fit
 from tuning.objective.prepare import fingerprint, prepare
 from tuning.parallel.cluster import Cluster, ClusterError
 from tuning.parallel.ranks import Ranks, rank_here

@@ -15,7 +15,7 @@ from torchblur.params import build
 from torchblur.presets import create_filter, load_preset
 from tuning.config.fit import BlackBoxMethod, FilterSpec, GradientMethod, TuneConfig
 from tuning.data.blurring import blurred
-from tuning.fit import run_fit
+from tuning.fit.run import run_fit
 from tuning.methods.blackbox import BlackBoxJob, fit_blackbox
 from tuning.methods.gradient import FitError, GradientJob, fit_gradient
 from tuning.objective.sensitivity import sensitivities

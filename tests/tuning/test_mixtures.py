@@ -16,7 +16,7 @@ from tuning.config.data import DataSpec
 from tuning.config.fit import TuneConfig, resolve
 from tuning.config.objective import ObjectiveSpec
 from tuning.data.loading import load_cases
-from tuning.fit import run_fit
+from tuning.fit.run import run_fit
 from tuning.objective.problem import Problem
 from tuning.objective.windows import make_samples, window_weights
 

@@ -13,7 +13,7 @@ from torchblur.params import build
 from torchblur.presets import create_filter, load_preset
 from tuning.config.cost import cost_of
 from tuning.config.fit import TuneConfig, load_tune_config
-from tuning.fit import run_fit
+from tuning.fit.run import run_fit
 from tuning.results.fit import FitResult
 
 SEARCH = {

@@ -14,7 +14,7 @@ from torchblur.params import build
 from torchblur.render import draw_scene, load_family
 from tuning.config.fit import TuneConfig, resolve
 from tuning.config.objective import ObjectiveSpec
-from tuning.fit import run_fit
+from tuning.fit.run import run_fit
 from tuning.methods.scene_pool import Pool
 from tuning.objective.batches import FrameGroup, SequenceGroup, join
 from tuning.objective.cpu_time import Meter

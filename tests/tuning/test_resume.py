@@ -10,20 +10,20 @@ import pytest
 import torch
 from planted import FIXED, write_planted
 
-import tuning.fit
+import tuning.fit.run
 from torchblur.errors import OutputError
 from torchblur.io import save_yaml
 from torchblur.params import build
 from tuning.config.fit import BlackBoxMethod, FilterSpec, TuneConfig, load_tune_config
 from tuning.files.run_folder import RunFolder, open_run, trim_torn_line
-from tuning.fit import run_fit
+from tuning.fit.run import run_fit
 from tuning.methods.blackbox import BlackBoxJob, fit_blackbox
 from tuning.objective.space import make_space
 
 RUN = """
 import sys
 from tuning.config.fit import load_tune_config
-from tuning.fit import run_fit
+from tuning.fit.run import run_fit
 run_fit(load_tune_config(sys.argv[1]), sys.argv[2], resume=True, progress=lambda e: print(
     e.stage, e.done, flush=True))
 """
@@ -189,7 +189,7 @@ def test_torn_lines_of_a_killed_writer(config, tmp_path, whole):
 
 def test_finished_run_is_not_done_again(config, tmp_path, monkeypatch):
     first = run_fit(config, tmp_path / "run")
-    monkeypatch.setattr(tuning.fit, "prepare", None)
+    monkeypatch.setattr(tuning.fit.run, "prepare", None)
     assert run_fit(config, tmp_path / "run", resume=True) == first
 
 

@@ -17,7 +17,7 @@ from tuning.config.fit import FilterSpec, TuneConfig, resolve
 from tuning.config.methods import BlackBoxMethod, PruningSpec
 from tuning.config.objective import ObjectiveSpec
 from tuning.files.run_folder import RunFolder
-from tuning.fit import run_fit
+from tuning.fit.run import run_fit
 from tuning.methods.blackbox import BlackBoxJob, fit_blackbox
 from tuning.methods.polish import is_promising
 from tuning.methods.pruning import Ladder, rung_sizes

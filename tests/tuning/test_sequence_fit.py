@@ -19,7 +19,7 @@ from tuning.config.data import Crops
 from tuning.config.fit import BlackBoxMethod, FilterSpec, GradientMethod, ObjectiveSpec, TuneConfig
 from tuning.data.blurring import arguments, blurred_sequence
 from tuning.data.variants import Variant
-from tuning.fit import run_fit
+from tuning.fit.run import run_fit
 from tuning.methods.blackbox import BlackBoxJob, fit_blackbox
 from tuning.methods.gradient import FitError, GradientJob, fit_gradient
 from tuning.objective.problem import Problem

@@ -8,7 +8,7 @@ from planted import write_planted
 from torchblur.errors import ConfigError
 from torchblur.io import load_yaml, save_yaml
 from tuning.config.fit import load_tune_config
-from tuning.fit import run_fit
+from tuning.fit.run import run_fit
 
 DATA = {"root": "../frames", "train": [{"kind": "scene", "path": "a.yaml", "spp": 32}]}
 CONFIG = {"filter": {"kind": "guertin2014", "free": ["kappa"]}, "data": "shared/d.yaml"}

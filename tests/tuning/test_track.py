@@ -15,9 +15,9 @@ from torchblur.io import save_yaml
 from torchblur.params import build
 from tuning.commands import app
 from tuning.config.fit import TuneConfig
-from tuning.fit import run_fit
+from tuning.fit.run import run_fit
+from tuning.fit.tensorboard import Tracker, tracking
 from tuning.progress import ProgressEvent
-from tuning.track import Tracker, tracking
 
 pytest.importorskip("tensorboard")
 

@@ -16,11 +16,12 @@ from typing import Any
 
 from torchblur.filters import BlurFilter, get_filter
 from torchblur.presets import Preset, save_preset
-from tuning.ceiling import ceiling
 from tuning.config.fit import GradientMethod, TuneConfig, resolve
 from tuning.data.cases import AnyCase, SequenceCase
 from tuning.data.variants import Variant
 from tuning.files.run_folder import RunFolder, open_run
+from tuning.fit.ceiling import ceiling
+from tuning.fit.front_scores import budget_notes, judged
 from tuning.methods.run import run_methods
 from tuning.objective.prepare import fit_device, prepare
 from tuning.objective.problem import Problem
@@ -29,7 +30,6 @@ from tuning.objective.space import Space
 from tuning.parallel.cluster import Cluster, ClusterError
 from tuning.parallel.cluster_problem import ClusterProblem
 from tuning.parallel.ranks import is_restarted, join_ranks
-from tuning.pareto_scores import budget_notes, judged
 from tuning.progress import Progress, ProgressEvent, Stage
 from tuning.report.evidence import evidence_of
 from tuning.report.fit import write_report
