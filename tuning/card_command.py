@@ -28,7 +28,7 @@ def card(
 
     A card is a Markdown file with a picture. A run with quality levels gives one for each level.
     """
-    from tuning.card_files import write_cards
+    from tuning.cards.write import write_cards
 
     for run in runs:
         with show_progress() as progress:

@@ -14,9 +14,9 @@ from torchblur.errors import ConfigError, OutputError
 from torchblur.metrics import display_encode
 from torchblur.params import build
 from torchblur.presets import load_preset
-from tuning.card import Card, card_text
-from tuning.card_files import write_cards
-from tuning.card_picture import card_picture
+from tuning.cards.picture import card_picture
+from tuning.cards.text import Card, card_text
+from tuning.cards.write import write_cards
 from tuning.commands import app
 from tuning.config.fit import TuneConfig, load_tune_config
 from tuning.data.loading import load_cases

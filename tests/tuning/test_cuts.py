@@ -13,7 +13,7 @@ from torchblur.filters import get_filter
 from torchblur.frame import Shutter
 from torchblur.params import build
 from torchblur.presets import load_preset
-from tuning.card import Card, card_text
+from tuning.cards.text import Card, card_text
 from tuning.config.fit import TuneConfig, load_tune_config
 from tuning.data.variants import Variant, cut_of
 from tuning.fit.run import run_fit

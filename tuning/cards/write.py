@@ -10,8 +10,8 @@ from PIL import Image
 from torchblur.errors import ConfigError, OutputError
 from torchblur.io.paths import output_file
 from torchblur.presets import load_preset, save_preset
-from tuning.card import Card, card_text
-from tuning.card_picture import card_picture
+from tuning.cards.picture import card_picture
+from tuning.cards.text import Card, card_text
 from tuning.config.fit import load_tune_config
 from tuning.data.cases import AnyCase
 from tuning.data.loading import load_cases

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from torchblur.filters import get_filter
 from torchblur.metrics import display_encode, flip_ldr
-from tuning.card import Card
+from tuning.cards.text import Card
 from tuning.data.cases import AnyCase, Case
 from tuning.data.variants import Variant, render, render_frames
 
