@@ -34,8 +34,8 @@ def ablate(
 
     The folder gets table.md, table.json, and ablation.html with a slider for each claim.
     """
-    from tuning.ablation import load_ablation_config, run_ablation
-    from tuning.ablation_files import check_outputs, write_ablation
+    from tuning.experiments.ablation.run import load_ablation_config, run_ablation
+    from tuning.experiments.ablation.write import check_outputs, write_ablation
     from tuning.printing import print_ablation
 
     folder = output or Path("runs") / config.stem

@@ -16,8 +16,6 @@ from torchblur.filters import BlurFilter, get_filter, registered_filters
 from torchblur.io import Inspection
 from torchblur.io.inspect import ChannelInfo
 from torchblur.params import Param, choices, declared
-from tuning.ablation import AblationConfig, Measured
-from tuning.ablation_files import RULE, tally
 from tuning.batch.run import BatchResult, Plan
 from tuning.console import (
     log,
@@ -28,6 +26,8 @@ from tuning.console import (
     print_warning,
     results,
 )
+from tuning.experiments.ablation.run import AblationConfig, Measured
+from tuning.experiments.ablation.write import RULE, tally
 from tuning.files.outputs import State
 from tuning.reach_advice import SHUTTER, reach_advice
 from tuning.report.front import preset_names

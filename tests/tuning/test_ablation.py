@@ -13,9 +13,14 @@ from torchblur.errors import ConfigError, OutputError
 from torchblur.filters import get_filter
 from torchblur.io import write_frame, write_image
 from torchblur.metrics import evaluate
-from tuning.ablation import AblationConfig, load_ablation_config, run_ablation, verdict_of
-from tuning.ablation_files import write_ablation
 from tuning.commands import app
+from tuning.experiments.ablation.run import (
+    AblationConfig,
+    load_ablation_config,
+    run_ablation,
+    verdict_of,
+)
+from tuning.experiments.ablation.write import write_ablation
 
 SCENE = """
 camera: {position: [0, 0, 5]}

@@ -11,7 +11,7 @@ from typing import Any
 
 from torchblur.errors import OutputError
 from torchblur.io.paths import output_file
-from tuning.ablation import AblationConfig, Measured
+from tuning.experiments.ablation.run import AblationConfig, Measured
 from tuning.files.outputs import make_folders
 from tuning.report.page import View, make_view, render_page
 
