@@ -35,10 +35,23 @@ def crossfit(
     Each fit is kept, in a run folder of its own: what was stopped goes on when started again, and
     another filter costs no more than itself.
     """
-    from tuning.crossfit import run_crossfit
-    from tuning.crossfit_config import load_crossfit_config
-    from tuning.crossfit_files import COLUMNS, TARGETS, UNSURE, cell, note_of, write_crossfit
-    from tuning.crossfit_summary import MEAN, cut_texts, mean_names, summary_of, verdicts
+    from tuning.experiments.crossfit.config import load_crossfit_config
+    from tuning.experiments.crossfit.run import run_crossfit
+    from tuning.experiments.crossfit.summary import (
+        MEAN,
+        cut_texts,
+        mean_names,
+        summary_of,
+        verdicts,
+    )
+    from tuning.experiments.crossfit.write import (
+        COLUMNS,
+        TARGETS,
+        UNSURE,
+        cell,
+        note_of,
+        write_crossfit,
+    )
 
     folder = output or Path("runs") / config.stem
     loaded = load_crossfit_config(config, set_ or [])

@@ -12,7 +12,7 @@ import torch
 from tiny_shots import box_blur, moving_square
 from typer.testing import CliRunner
 
-import tuning.crossfit
+import tuning.experiments.crossfit.run
 import tuning.methods.gradient_state
 from torchblur.errors import ConfigError
 from torchblur.filters import get_filter
@@ -22,11 +22,26 @@ from torchblur.metrics import border_band, evaluate
 from torchblur.params import build
 from tuning.commands import app
 from tuning.config.fit import TuneConfig
-from tuning.crossfit import run_crossfit
-from tuning.crossfit_config import Bootstrap, load_crossfit_config
-from tuning.crossfit_files import write_crossfit
-from tuning.crossfit_summary import MEAN, final_variants, is_met, mean_names, summary_of, verdicts
-from tuning.crossfit_tiles import GAINS, METRICS, Figure, Sums, draws_of, figures_of, summarize
+from tuning.experiments.crossfit.bootstrap import (
+    GAINS,
+    METRICS,
+    Figure,
+    Sums,
+    draws_of,
+    figures_of,
+    summarize,
+)
+from tuning.experiments.crossfit.config import Bootstrap, load_crossfit_config
+from tuning.experiments.crossfit.run import run_crossfit
+from tuning.experiments.crossfit.summary import (
+    MEAN,
+    final_variants,
+    is_met,
+    mean_names,
+    summary_of,
+    verdicts,
+)
+from tuning.experiments.crossfit.write import write_crossfit
 from tuning.objective.prepare import prepare
 
 FILES = {"sharp": "sharp.####.exr", "reference": "reference.####.exr"}
@@ -301,8 +316,10 @@ class TestBootstrap:
     def test_cut_tiles_count_by_their_pixels(self, finished):
         """48x64 px in tiles of 20 px: the last row and column are smaller."""
         config = loaded(finished.root, lambda d: d["bootstrap"].update(tile=20), "tiles.yaml")
-        cases = tuning.crossfit._load(config, config.scored("one"), "cases.one")
-        sums = tuning.crossfit.tile_sums(cases, tuning.crossfit.Variant(name="sharp"), 20)
+        cases = tuning.experiments.crossfit.run._load(config, config.scored("one"), "cases.one")
+        sums = tuning.experiments.crossfit.run.tile_sums(
+            cases, tuning.experiments.crossfit.run.Variant(name="sharp"), 20
+        )
         assert sums.arrays["count"].tolist() == [*[400.0, 400, 400, 80] * 2, 160, 160, 160, 32]
         whole = figures_of(sums, sums, np.ones((1, 12)))
         figure = finished.row("one", "sharp", "").figures["flip"]
@@ -427,19 +444,23 @@ class TestResume:
             assert steps == [(m, step) for m in (0, 1) for step in range(3)]
 
     def test_what_is_there_is_not_done_again(self, finished, monkeypatch):
-        monkeypatch.setattr(tuning.crossfit, "prepare", None)
-        monkeypatch.setattr(tuning.crossfit, "tile_sums", None)
+        monkeypatch.setattr(tuning.experiments.crossfit.run, "prepare", None)
+        monkeypatch.setattr(tuning.experiments.crossfit.run, "tile_sums", None)
         events = []
         found = run_crossfit(finished.config, finished.folder, events.append)
         assert timeless(found) == timeless(finished.found)
         assert [(e.done, e.total) for e in events] == [(6, 6)]
 
     def test_new_source_scores_anew_and_keeps_the_fits(self, finished, monkeypatch):
-        monkeypatch.setattr(tuning.crossfit, "source_hash", lambda: "another filter")
-        monkeypatch.setattr(tuning.crossfit, "prepare", None)
-        scored, score = [], tuning.crossfit.tile_sums
         monkeypatch.setattr(
-            tuning.crossfit, "tile_sums", lambda *given: scored.append(given) or score(*given)
+            tuning.experiments.crossfit.run, "source_hash", lambda: "another filter"
+        )
+        monkeypatch.setattr(tuning.experiments.crossfit.run, "prepare", None)
+        scored, score = [], tuning.experiments.crossfit.run.tile_sums
+        monkeypatch.setattr(
+            tuning.experiments.crossfit.run,
+            "tile_sums",
+            lambda *given: scored.append(given) or score(*given),
         )
         run_crossfit(finished.config, finished.folder)
         assert len(scored) == 3 * 7

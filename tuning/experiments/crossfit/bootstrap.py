@@ -17,9 +17,9 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchblur.metrics import flip_ldr, ssim
-from tuning.crossfit_config import Bootstrap
 from tuning.data.cases import AnyCase, Case
 from tuning.data.variants import Variant, render, render_frames
+from tuning.experiments.crossfit.config import Bootstrap
 
 __all__ = ["GAINS", "METRICS", "Figure", "Sums", "draws_of", "figures_of", "summarize", "tile_sums"]
 

@@ -8,9 +8,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tuning.crossfit import Crossfit, Scored
-from tuning.crossfit_config import CrossfitConfig, Target
-from tuning.crossfit_tiles import Figure, draws_of, figures_of, summarize
+from tuning.experiments.crossfit.bootstrap import Figure, draws_of, figures_of, summarize
+from tuning.experiments.crossfit.config import CrossfitConfig, Target
+from tuning.experiments.crossfit.run import Crossfit, Scored
 from tuning.results.cuts import cuts_over
 
 __all__ = [

@@ -11,11 +11,18 @@ from importlib.metadata import version
 from pathlib import Path
 
 from torchblur.io.paths import output_file
-from tuning.crossfit import Crossfit, Fold
-from tuning.crossfit_config import CrossfitConfig
-from tuning.crossfit_plots import plot_crossfit
-from tuning.crossfit_summary import MEAN, Row, cut_texts, mean_names, summary_of, verdicts
-from tuning.crossfit_tiles import Figure
+from tuning.experiments.crossfit.bootstrap import Figure
+from tuning.experiments.crossfit.config import CrossfitConfig
+from tuning.experiments.crossfit.plot import plot_crossfit
+from tuning.experiments.crossfit.run import Crossfit, Fold
+from tuning.experiments.crossfit.summary import (
+    MEAN,
+    Row,
+    cut_texts,
+    mean_names,
+    summary_of,
+    verdicts,
+)
 from tuning.files.outputs import make_folders
 
 __all__ = ["COLUMNS", "TARGETS", "UNSURE", "cell", "note_of", "write_crossfit"]

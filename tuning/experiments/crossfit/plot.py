@@ -11,9 +11,9 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
 
 from torchblur.io.paths import output_file
-from tuning.crossfit import Crossfit
-from tuning.crossfit_config import CrossfitConfig
-from tuning.crossfit_summary import Row, final_variants, mean_names
+from tuning.experiments.crossfit.config import CrossfitConfig
+from tuning.experiments.crossfit.run import Crossfit
+from tuning.experiments.crossfit.summary import Row, final_variants, mean_names
 from tuning.report.plots import color_of, style
 
 __all__ = ["plot_crossfit"]

@@ -22,11 +22,11 @@ from torchblur.io.paths import output_file
 from torchblur.params import build
 from tuning.config.data import DataItem, DataSpec
 from tuning.config.fit import TuneConfig
-from tuning.crossfit_config import CrossfitConfig
-from tuning.crossfit_tiles import Sums, tile_sums
 from tuning.data.cases import AnyCase, check_needs
 from tuning.data.loading import load_cases
 from tuning.data.variants import Variant, cut_of
+from tuning.experiments.crossfit.bootstrap import Sums, tile_sums
+from tuning.experiments.crossfit.config import CrossfitConfig
 from tuning.files.outputs import make_folders
 from tuning.files.run_folder import open_run
 from tuning.methods.run import run_methods
