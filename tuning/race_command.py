@@ -31,10 +31,10 @@ def race(
     The folder gets tables.md, race.json, points.csv and a plot for each problem. Each fit is kept:
     a stopped race goes on when started again, and another method costs no more than itself.
     """
-    from tuning.race import run_race
-    from tuning.race_config import load_race_config
-    from tuning.race_files import COLUMNS, SHORT, cells, note_of, write_race
-    from tuning.race_summary import standings
+    from tuning.experiments.race.config import load_race_config
+    from tuning.experiments.race.run import run_race
+    from tuning.experiments.race.summary import standings
+    from tuning.experiments.race.write import COLUMNS, SHORT, cells, note_of, write_race
 
     folder = output or Path("runs") / config.stem
     loaded = load_race_config(config, set_ or [])

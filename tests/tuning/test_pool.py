@@ -14,6 +14,7 @@ from torchblur.params import build
 from torchblur.render import draw_scene, load_family
 from tuning.config.fit import TuneConfig, resolve
 from tuning.config.objective import ObjectiveSpec
+from tuning.experiments.race.config import load_race_config
 from tuning.fit.run import run_fit
 from tuning.methods.scene_pool import Pool
 from tuning.objective.batches import FrameGroup, SequenceGroup, join
@@ -21,7 +22,6 @@ from tuning.objective.cpu_time import Meter
 from tuning.objective.prepare import prepare
 from tuning.objective.windows import make_samples
 from tuning.parallel.sharded_problem import ShardedProblem
-from tuning.race_config import load_race_config
 
 CONFIGS = Path(__file__).parents[2] / "configs"
 TINY = {"size": "48x28", "spp": 4, "color_spp": 2}

@@ -9,14 +9,14 @@ import pytest
 from planted import FIXED, write_planted
 from typer.testing import CliRunner
 
-import tuning.race
+import tuning.experiments.race.run
 from torchblur.errors import ConfigError
 from torchblur.io import save_yaml
 from tuning.commands import app
-from tuning.race import Curve, Point, _best_by, _Event, grid, run_race
-from tuning.race_config import load_race_config
-from tuning.race_files import write_race
-from tuning.race_summary import at, median_curve, standings, target_of
+from tuning.experiments.race.config import load_race_config
+from tuning.experiments.race.run import Curve, Point, _best_by, _Event, grid, run_race
+from tuning.experiments.race.summary import at, median_curve, standings, target_of
+from tuning.experiments.race.write import write_race
 
 PLANT = {"kappa": 6.0, "third_gain": 4.0}
 FREE = {
@@ -150,17 +150,19 @@ class TestRun:
         assert point.params["third_gain"] != 2.0
 
     def test_planted_references_are_the_filter_s_own(self, finished, monkeypatch):
-        track = tuning.race._load(finished.config, finished.config.problems[1])
+        track = tuning.experiments.race.run._load(finished.config, finished.config.problems[1])
         planted = PLANT | {"tile_size": 12}
         assert float(track.train.mean(planted)) == 0
         assert float(track.holdout.mean(planted)) == 0
-        real = tuning.race._load(finished.config, finished.config.problems[0])
+        real = tuning.experiments.race.run._load(finished.config, finished.config.problems[0])
         assert float(real.train.mean(planted)) > 1e-7
 
     def test_distance_is_of_the_unit_cube(self, finished):
         assert all(p.distance is None for p in finished.curve("frames", "search").points)
         start = finished.curve("planted", "search").points[0]
-        space = tuning.race._load(finished.config, finished.config.problems[1]).space
+        space = tuning.experiments.race.run._load(
+            finished.config, finished.config.problems[1]
+        ).space
         unit = space.subset(("kappa", "third_gain"))
         gaps = (unit.to_unit(start.params) - unit.to_unit(PLANT)).abs()
         assert start.distance == pytest.approx(float(gaps.max()))
@@ -189,7 +191,7 @@ class TestResume:
         assert timeless(run_race(finished.config, tmp_path)) == timeless(finished.curves)
 
     def test_what_is_there_is_not_done_again(self, finished, monkeypatch):
-        monkeypatch.setattr(tuning.race, "prepare", None)
+        monkeypatch.setattr(tuning.experiments.race.run, "prepare", None)
         assert run_race(finished.config, finished.folder) == finished.curves
 
     def test_another_entrant_costs_its_own_fits(self, finished, tmp_path, monkeypatch):
@@ -199,9 +201,11 @@ class TestResume:
         )
         save_yaml(finished.root / "more.yaml", data, overwrite=True)
         config = load_race_config(finished.root / "more.yaml")
-        runs, run = [], tuning.race._run
+        runs, run = [], tuning.experiments.race.run._run
         monkeypatch.setattr(
-            tuning.race, "_run", lambda fit, track, path: runs.append(path) or run(fit, track, path)
+            tuning.experiments.race.run,
+            "_run",
+            lambda fit, track, path: runs.append(path) or run(fit, track, path),
         )
         curves = run_race(config, finished.folder)
         assert [path.name.rpartition(".")[0] for path in runs] == ["frames.more.1", "frames.more.2"]

@@ -11,11 +11,11 @@ from importlib.metadata import version
 from pathlib import Path
 
 from torchblur.io.paths import output_file
+from tuning.experiments.race.config import RaceConfig, RaceProblem
+from tuning.experiments.race.plot import plot_race
+from tuning.experiments.race.run import Curve
+from tuning.experiments.race.summary import NEAR, Standing, standings
 from tuning.files.outputs import make_folders
-from tuning.race import Curve
-from tuning.race_config import RaceConfig, RaceProblem
-from tuning.race_plots import plot_race
-from tuning.race_summary import NEAR, Standing, standings
 from tuning.study import slug
 
 __all__ = ["COLUMNS", "SHORT", "cells", "note_of", "write_race"]

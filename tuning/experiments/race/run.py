@@ -23,6 +23,7 @@ from tuning.config.fit import TuneConfig, resolve
 from tuning.config.methods import GradientMethod
 from tuning.data.cases import AnyCase, Case
 from tuning.data.variants import Variant, render
+from tuning.experiments.race.config import Entrant, RaceConfig, RaceProblem
 from tuning.files.run_folder import RunFolder, open_run
 from tuning.methods.run import run_methods
 from tuning.objective.prepare import prepare
@@ -30,7 +31,6 @@ from tuning.objective.problem import Problem
 from tuning.objective.space import Space
 from tuning.objective.windows import make_samples
 from tuning.progress import Progress, Stage
-from tuning.race_config import Entrant, RaceConfig, RaceProblem
 from tuning.results.fit import MethodResult
 from tuning.study import slug
 

@@ -7,8 +7,8 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from tuning.race import Curve, Point
-from tuning.race_config import RaceConfig, RaceProblem
+from tuning.experiments.race.config import RaceConfig, RaceProblem
+from tuning.experiments.race.run import Curve, Point
 
 __all__ = ["NEAR", "Standing", "at", "median_curve", "standings", "target_of"]
 

@@ -10,10 +10,10 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from torchblur.io.paths import output_file
-from tuning.race import Curve, Point, grid
-from tuning.race_config import RaceConfig, RaceProblem
-from tuning.race_summary import Figure as PointFigure
-from tuning.race_summary import median_curve, target_of
+from tuning.experiments.race.config import RaceConfig, RaceProblem
+from tuning.experiments.race.run import Curve, Point, grid
+from tuning.experiments.race.summary import Figure as PointFigure
+from tuning.experiments.race.summary import median_curve, target_of
 from tuning.report.plots import color_of, style
 
 __all__ = ["plot_race"]
