@@ -67,9 +67,9 @@ def study(
     and sheets of pictures. What is measured and rendered is kept: a stopped study goes on when
     started again, and another variant costs no more than itself.
     """
-    from tuning.study import run_study
-    from tuning.study_config import load_study_config
-    from tuning.study_files import check_study_outputs, write_study
+    from tuning.experiments.study.config import load_study_config
+    from tuning.experiments.study.run import run_study
+    from tuning.experiments.study.write import check_study_outputs, write_study
     from tuning.study_printing import print_study
 
     folder = output or Path("runs") / config.stem

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from tuning.console import metrics_table, results
-from tuning.study import FACTS, Row
+from tuning.experiments.study.run import FACTS, Row
 
 __all__ = ["print_study"]
 

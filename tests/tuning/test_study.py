@@ -8,7 +8,7 @@ import pytest
 import torch
 from typer.testing import CliRunner
 
-import tuning.study
+import tuning.experiments.study.run
 from torchblur.errors import ConfigError
 from torchblur.filters import get_filter
 from torchblur.frame import Frame, Shutter
@@ -18,12 +18,12 @@ from torchblur.metrics.pooling import weighted_median
 from torchblur.metrics.temporal import temporal_error
 from torchblur.render import load_scene, render_reference, render_revealed, render_stream
 from tuning.commands import app
-from tuning.study import FACTS, part_file, run_study
-from tuning.study_config import load_study_config
-from tuning.study_data import Moment, moments
-from tuning.study_figures import agreement, figures_of, hidden_mask, worth_of
-from tuning.study_files import curve_of, worth_table, write_study
-from tuning.study_rays import ray_mask_of
+from tuning.experiments.study.config import load_study_config
+from tuning.experiments.study.frames import Moment, moments
+from tuning.experiments.study.ray_mask import ray_mask_of
+from tuning.experiments.study.run import FACTS, part_file, run_study
+from tuning.experiments.study.scores import agreement, figures_of, hidden_mask, worth_of
+from tuning.experiments.study.write import curve_of, worth_table, write_study
 
 SCENE = """
 camera: {position: [0, 0, 5]}
@@ -140,9 +140,11 @@ class TestRun:
         config, folder = load_study_config(study), study.parent / "out"
         first = run_study(config, folder)
         calls = []
-        original = tuning.study.moments
+        original = tuning.experiments.study.run.moments
         monkeypatch.setattr(
-            tuning.study, "moments", lambda *args: calls.append(args) or original(*args)
+            tuning.experiments.study.run,
+            "moments",
+            lambda *args: calls.append(args) or original(*args),
         )
         assert run_study(config, folder) == first
         assert calls == []
@@ -154,7 +156,7 @@ class TestRun:
         edited(study, "{num_samples: 15}", "{num_samples: 9}")
         assert row_of(run_study(load_study_config(study), folder), "line") != row_of(first, "line")
         assert len(calls) == 2
-        monkeypatch.setattr(tuning.study, "source_hash", lambda: "another filter")
+        monkeypatch.setattr(tuning.experiments.study.run, "source_hash", lambda: "another filter")
         run_study(config, folder)
         assert len(calls) == 3
 

@@ -27,13 +27,13 @@ from tuning.data.loading import load_cases
 from tuning.data.variants import Variant, cut_of
 from tuning.experiments.crossfit.bootstrap import Sums, tile_sums
 from tuning.experiments.crossfit.config import CrossfitConfig
+from tuning.experiments.study.run import slug, source_hash
 from tuning.files.outputs import make_folders
 from tuning.files.run_folder import open_run
 from tuning.methods.run import run_methods
 from tuning.objective.prepare import fit_device, prepare
 from tuning.parallel.processes import worker_pool
 from tuning.progress import Progress, Stage
-from tuning.study import slug, source_hash
 
 __all__ = ["Crossfit", "Fold", "Scored", "run_crossfit"]
 

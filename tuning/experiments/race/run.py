@@ -24,6 +24,7 @@ from tuning.config.methods import GradientMethod
 from tuning.data.cases import AnyCase, Case
 from tuning.data.variants import Variant, render
 from tuning.experiments.race.config import Entrant, RaceConfig, RaceProblem
+from tuning.experiments.study.run import slug
 from tuning.files.run_folder import RunFolder, open_run
 from tuning.methods.run import run_methods
 from tuning.objective.prepare import prepare
@@ -32,7 +33,6 @@ from tuning.objective.space import Space
 from tuning.objective.windows import make_samples
 from tuning.progress import Progress, Stage
 from tuning.results.fit import MethodResult
-from tuning.study import slug
 
 __all__ = ["Curve", "Point", "grid", "run_race"]
 

@@ -15,8 +15,8 @@ from tuning.experiments.race.config import RaceConfig, RaceProblem
 from tuning.experiments.race.plot import plot_race
 from tuning.experiments.race.run import Curve
 from tuning.experiments.race.summary import NEAR, Standing, standings
+from tuning.experiments.study.run import slug
 from tuning.files.outputs import make_folders
-from tuning.study import slug
 
 __all__ = ["COLUMNS", "SHORT", "cells", "note_of", "write_race"]
 

@@ -27,12 +27,18 @@ from torchblur.filters import BlurFilter, History, TemporalBlur
 from torchblur.frame import Frame
 from torchblur.io.paths import output_file
 from torchblur.metrics import FlipReference, border_band, prepare_flip_ldr
+from tuning.experiments.study.config import (
+    StudyConfig,
+    StudyExr,
+    StudyScene,
+    StudyVariant,
+    make_filter,
+)
+from tuning.experiments.study.frames import Moment, identity_of, moments
+from tuning.experiments.study.ray_mask import ray_facts, ray_mask_of, shutter_values, with_revealed
+from tuning.experiments.study.scores import figures_of, hidden_mask, moving_mask, steadiness_of
 from tuning.files.images import write_color
 from tuning.progress import Progress, Stage
-from tuning.study_config import StudyConfig, StudyExr, StudyScene, StudyVariant, make_filter
-from tuning.study_data import Moment, identity_of, moments
-from tuning.study_figures import figures_of, hidden_mask, moving_mask, steadiness_of
-from tuning.study_rays import ray_facts, ray_mask_of, shutter_values, with_revealed
 
 FACTS = "ray mask"
 """Name of the variant that stands for figures of the data themselves."""

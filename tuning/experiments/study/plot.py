@@ -13,8 +13,8 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator
 
 from torchblur.io.paths import output_file
+from tuning.experiments.study.run import Row
 from tuning.report.plots import color_of, style
-from tuning.study import Row
 
 __all__ = ["plot_samples", "plot_time"]
 

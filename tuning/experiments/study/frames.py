@@ -19,8 +19,8 @@ from torchblur.render import Renderer, Scene, load_scene, render_revealed
 from torchblur.render.camera import Camera
 from torchblur.render.compiling import Engine
 from tuning.data.cache import cache_key, cached, frame_of, hash_scene, planes_of
+from tuning.experiments.study.config import KEPT_SAMPLES, StudyExr, StudyScene
 from tuning.files.frame_numbers import numbered_file
-from tuning.study_config import KEPT_SAMPLES, StudyExr, StudyScene
 
 __all__ = ["Moment", "identity_of", "moments", "scene_of"]
 

@@ -17,9 +17,9 @@ from torchblur.filters.spreads import spread_of
 from torchblur.frame import Frame, Shutter
 from torchblur.ops.raymask import edge_strength, ray_mask, uncovered
 from torchblur.render import render_revealed
-from tuning.study_config import StudyExr, StudyScene
-from tuning.study_data import Moment, scene_of
-from tuning.study_figures import agreement, hidden_mask
+from tuning.experiments.study.config import StudyExr, StudyScene
+from tuning.experiments.study.frames import Moment, scene_of
+from tuning.experiments.study.scores import agreement, hidden_mask
 
 __all__ = ["ray_facts", "ray_mask_of", "shutter_values", "with_revealed"]
 

@@ -14,7 +14,7 @@ from torchblur.metrics import FlipReference, masked_mean, ssim
 from torchblur.metrics.pooling import weighted_median
 from torchblur.metrics.psnr import decibels
 from torchblur.metrics.temporal import temporal_error
-from tuning.study_data import Moment
+from tuning.experiments.study.frames import Moment
 
 __all__ = ["agreement", "figures_of", "hidden_mask", "moving_mask", "steadiness_of", "worth_of"]
 
