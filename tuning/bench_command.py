@@ -80,9 +80,9 @@ def bench(  # noqa: PLR0913 - each argument is an option
     import json
 
     from torchblur.params import build
-    from tuning.bench import run_bench
-    from tuning.bench_cases import Report
-    from tuning.bench_plan import BenchOptions
+    from tuning.bench.cases import Report
+    from tuning.bench.plan import BenchOptions
+    from tuning.bench.run import run_bench
     from tuning.bench_table import print_report
     from tuning.config.overrides import apply_overrides
 

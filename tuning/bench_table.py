@@ -6,9 +6,9 @@ from collections.abc import Callable, Sequence
 
 from rich.text import Text
 
-from tuning.bench_cases import LinearFit, Report, Row, Table, TargetRow, cost_of
-from tuning.bench_step import METRIC_PARTS, RENDER_SCENE, STEP_PARTS
-from tuning.bench_targets import KNOWN
+from tuning.bench.cases import LinearFit, Report, Row, Table, TargetRow, cost_of
+from tuning.bench.fit_step import METRIC_PARTS, RENDER_SCENE, STEP_PARTS
+from tuning.bench.targets import KNOWN
 from tuning.console import plain_table, print_error, print_warning, results
 
 __all__ = ["print_report"]

@@ -12,11 +12,11 @@ import torch
 from typer.testing import CliRunner
 
 from torchblur.errors import ConfigError, OutputError
-from tuning.bench import Limits, check_output, measure_cases, run_bench
-from tuning.bench_cases import Case, Report, Row
-from tuning.bench_child import MARK, BenchJob, run_job
-from tuning.bench_measure import Times
-from tuning.bench_plan import TABLES, BenchOptions, plan_tables, unique_cases
+from tuning.bench.cases import Case, Report, Row
+from tuning.bench.child import MARK, BenchJob, run_job
+from tuning.bench.measure import Times
+from tuning.bench.plan import TABLES, BenchOptions, plan_tables, unique_cases
+from tuning.bench.run import Limits, check_output, measure_cases, run_bench
 from tuning.commands import app
 
 TINY = Case(filter="line", width=24, height=16, num_samples=3)
@@ -164,8 +164,8 @@ class TestJobs:
         assert told[1]["wall_s"] > 0
 
     def test_missing_compiler_is_told(self, monkeypatch):
-        monkeypatch.setattr("tuning.bench_child.compiler_works", lambda: False)
-        monkeypatch.setattr("tuning.bench_child.make_call", lambda case: lambda: None)
+        monkeypatch.setattr("tuning.bench.child.compiler_works", lambda: False)
+        monkeypatch.setattr("tuning.bench.child.make_call", lambda case: lambda: None)
         told = {}
         job = BenchJob(cases=[TINY.but(engine="compiled")], runs=1, memory=False)
         run_job(job, told.__setitem__)
@@ -181,7 +181,7 @@ class TestJobsOnAGpu:
             raise RuntimeError("not permitted while a stream is capturing\nmore")
 
         times = Times(runs=3, wall=0.1, cpu=0.1, device=0.5, spread=0.0, others=None, waited=False)
-        child = "tuning.bench_child"
+        child = "tuning.bench.child"
         monkeypatch.setattr(f"{child}.make_call", lambda case: lambda: None)
         monkeypatch.setattr(f"{child}.repeat", lambda *args: times)
         monkeypatch.setattr(f"{child}.peak_mib", lambda call, device: 3.0)
@@ -219,7 +219,7 @@ class TestProcesses:
             f"print({line!r}); print({more!r}, flush=True)\n"
             "sys.stderr.write('a\\nthe stack broke\\n'); sys.stderr.flush(); os._exit(3)"
         )
-        monkeypatch.setattr("tuning.bench._COMMAND", (sys.executable, "-c", code))
+        monkeypatch.setattr("tuning.bench.run._COMMAND", (sys.executable, "-c", code))
         (rows,) = measure_cases([TINY, TINY.but(num_samples=5)], Limits())
         first, second = rows.values()
         assert (first.cpu_s, first.peak_mib, first.error) == (2.0, 5.0, None)
@@ -231,7 +231,7 @@ class TestProcesses:
             for checks in ({"memory": "no room"}, {"sync": "no"})
         ]
         code = f"import sys; sys.stdin.read(); print({lines[0]!r}); print({lines[1]!r})"
-        monkeypatch.setattr("tuning.bench._COMMAND", (sys.executable, "-c", code))
+        monkeypatch.setattr("tuning.bench.run._COMMAND", (sys.executable, "-c", code))
         (rows,) = measure_cases([TINY], Limits())
         assert rows[TINY.key].checks == {"memory": "no room", "sync": "no"}
 
@@ -241,7 +241,7 @@ class TestProcesses:
             f"for i in range(n): print({MARK!r} + json.dumps("
             "{'index': i, 'found': {'runs': n}}))"
         )
-        monkeypatch.setattr("tuning.bench._COMMAND", (sys.executable, "-c", code))
+        monkeypatch.setattr("tuning.bench.run._COMMAND", (sys.executable, "-c", code))
         cases = [TINY, TINY.but(num_samples=5), TINY.but(engine="compiled")]
         parts = list(measure_cases(cases, Limits()))
         assert [[row.runs for row in rows.values()] for rows in parts] == [[2, 2], [1]]
@@ -305,13 +305,13 @@ class TestWhole:
 
 
 def test_a_busy_machine_is_warned_of_at_once(monkeypatch, tmp_path):
-    monkeypatch.setattr("tuning.bench.watch", lambda: 1.3)
-    monkeypatch.setattr("tuning.bench.measure_cases", lambda cases, limits, stage: iter(()))
+    monkeypatch.setattr("tuning.bench.run.watch", lambda: 1.3)
+    monkeypatch.setattr("tuning.bench.run.measure_cases", lambda cases, limits, stage: iter(()))
     warned = []
     report = run_bench(BenchOptions(quick=True, only=("notes",)), warn=warned.append)
     assert warned == report.warnings
     assert "other programs use 1.3 of" in warned[0]
-    monkeypatch.setattr("tuning.bench.watch", lambda: 0.05)
+    monkeypatch.setattr("tuning.bench.run.watch", lambda: 0.05)
     assert run_bench(BenchOptions(quick=True, only=("notes",))).warnings == []
 
 
@@ -320,7 +320,7 @@ def test_what_was_measured_is_kept_when_stopped(monkeypatch, tmp_path):
         yield {cases[0].key: Row(case=cases[0], cpu_s=1.0)}
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("tuning.bench.measure_cases", stopped)
+    monkeypatch.setattr("tuning.bench.run.measure_cases", stopped)
     file = tmp_path / "a.json"
     result = run("--only", "notes", "--quick", "--json", file, code=130)
     assert "what was measured is in" in result.output
@@ -333,8 +333,8 @@ def test_a_time_limit_ends_the_process_that_measures(tmp_path):
     child = tmp_path / "child.pid"
     code = f"import os, time; open({str(child)!r}, 'w').write(str(os.getpid())); time.sleep(60)"
     main = (
-        "import sys, tuning.bench\n"
-        f"tuning.bench._COMMAND = (sys.executable, '-c', {code!r})\n"
+        "import sys, tuning.bench.run\n"
+        f"tuning.bench.run._COMMAND = (sys.executable, '-c', {code!r})\n"
         "from tuning.cli import main; main()"
     )
     args = [sys.executable, "-c", main, "bench", "--quick", "--only", "notes"]

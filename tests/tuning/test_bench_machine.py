@@ -8,7 +8,7 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from tuning.bench_machine import (
+from tuning.bench.machine import (
     CpuTicks,
     busy_warning,
     describe_machine,

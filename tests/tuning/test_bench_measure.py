@@ -9,14 +9,14 @@ import pytest
 import torch
 
 import torchblur
-from tuning.bench_measure import find_sync, graph_ms, place_of, repeat
+from tuning.bench.measure import find_sync, graph_ms, place_of, repeat
 
 LINE = str(Path(torchblur.__file__).parent / "filters" / "line.py")
 CPU = torch.device("cpu")
 
 MEMORY = """
 import torch
-from tuning.bench_measure import exact_allocation, peak_mib
+from tuning.bench.measure import exact_allocation, peak_mib
 
 torch.set_num_threads(1)
 kept = []
@@ -133,7 +133,7 @@ class TestOnAGpu:
             graph_ms(lambda: plane.sum().item(), runs=5)
 
     def test_events_and_memory(self):
-        from tuning.bench_measure import peak_mib
+        from tuning.bench.measure import peak_mib
 
         plane = torch.rand(1024, 1024, device="cuda")
         device = torch.device("cuda")

@@ -4,8 +4,8 @@ import math
 
 import pytest
 
-from tuning.bench_cases import Case, Row, cost_of
-from tuning.bench_ratios import fits_of, linear_fit, with_ratios
+from tuning.bench.cases import Case, Row, cost_of
+from tuning.bench.ratios import fits_of, linear_fit, with_ratios
 
 GUERTIN = Case(filter="guertin2014", num_samples=35, width=1000, height=1000)
 

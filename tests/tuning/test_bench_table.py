@@ -2,7 +2,7 @@
 
 import pytest
 
-from tuning.bench_cases import Case, LinearFit, Report, Row, Table, TargetRow
+from tuning.bench.cases import Case, LinearFit, Report, Row, Table, TargetRow
 from tuning.bench_table import print_report
 
 TINY = Case(filter="line", width=24, height=16, num_samples=3)

@@ -2,8 +2,8 @@
 
 import pytest
 
-from tuning.bench_cases import Case, Row
-from tuning.bench_targets import judge_targets, targets_for
+from tuning.bench.cases import Case, Row
+from tuning.bench.targets import judge_targets, targets_for
 
 GUERTIN = Case(
     filter="guertin2014", engine="compiled", width=1920, height=1080, num_samples=35, device="cpu"

@@ -5,9 +5,9 @@ import torch
 
 from torchblur.errors import ConfigError
 from torchblur.filters import get_filter, registered_filters
-from tuning.bench_cases import Case
-from tuning.bench_step import METRIC_PARTS, STEP_PARTS, Step, median_parts, render_parts
-from tuning.bench_work import bench_frame, make_call, make_filter, sets_of
+from tuning.bench.calls import bench_frame, make_call, make_filter, sets_of
+from tuning.bench.cases import Case
+from tuning.bench.fit_step import METRIC_PARTS, STEP_PARTS, Step, median_parts, render_parts
 
 SMALL = Case(filter="guertin2014", width=48, height=32, num_samples=5)
 
@@ -79,8 +79,8 @@ class TestCalls:
             made["frame"] = bench_frame(case)
             return made["frame"]
 
-        monkeypatch.setattr("tuning.bench_work.make_filter", watched)
-        monkeypatch.setattr("tuning.bench_work.bench_frame", framed)
+        monkeypatch.setattr("tuning.bench.calls.make_filter", watched)
+        monkeypatch.setattr("tuning.bench.calls.bench_frame", framed)
         grads = {}
         for what in ("forward", "backward", "parameters"):
             make_call(SMALL.but(what=what))()

@@ -12,8 +12,8 @@ from torchblur.errors import ConfigError, nearest_name
 from torchblur.filters import get_filter, registered_filters
 from torchblur.params import Config
 from torchblur.presets import load_preset
-from tuning.bench_cases import Case, What
-from tuning.bench_work import has_taps, refuse_unknown
+from tuning.bench.calls import has_taps, refuse_unknown
+from tuning.bench.cases import Case, What
 
 __all__ = ["TABLES", "BenchOptions", "TablePlan", "plan_tables", "unique_cases"]
 

@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
-from tuning.bench_cases import Case, LinearFit, Row, cost_of
+from tuning.bench.cases import Case, LinearFit, Row, cost_of
 
 __all__ = ["fits_of", "linear_fit", "with_ratios"]
 

@@ -19,18 +19,18 @@ from typing import IO, Any
 from torchblur.errors import ConfigError, OutputError
 from torchblur.params import Config
 from tuning.batch.apply import device_named
-from tuning.bench_cases import Case, Report, Row, Table
-from tuning.bench_child import MARK, BenchJob
-from tuning.bench_machine import busy_warning, describe_machine, watch
-from tuning.bench_plan import BenchOptions, TablePlan, plan_tables, unique_cases
-from tuning.bench_ratios import fits_of, with_ratios
-from tuning.bench_targets import judge_targets, targets_for
+from tuning.bench.cases import Case, Report, Row, Table
+from tuning.bench.child import MARK, BenchJob
+from tuning.bench.machine import busy_warning, describe_machine, watch
+from tuning.bench.plan import BenchOptions, TablePlan, plan_tables, unique_cases
+from tuning.bench.ratios import fits_of, with_ratios
+from tuning.bench.targets import judge_targets, targets_for
 from tuning.parallel.cores import count_cores
 from tuning.progress import Progress, Stage
 
 __all__ = ["Limits", "check_output", "measure_cases", "run_bench", "write_report"]
 
-_COMMAND = (sys.executable, "-m", "tuning.bench_child")
+_COMMAND = (sys.executable, "-m", "tuning.bench.child")
 _TARGET_THREADS = 2  # the targets of the CPU are for two cores
 _NOT_WITH_TARGETS = ("filters", "sizes", "num_samples", "what", "only", "engines", "full", "params")
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
-from tuning.bench_cases import Case, Row, TargetRow, cost_of
+from tuning.bench.cases import Case, Row, TargetRow, cost_of
 
 __all__ = ["KNOWN", "Target", "judge_targets", "targets_for"]
 

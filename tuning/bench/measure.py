@@ -14,7 +14,7 @@ from pathlib import Path
 import torch
 
 import torchblur
-from tuning.bench_machine import other_cores, read_ticks
+from tuning.bench.machine import other_cores, read_ticks
 
 __all__ = ["Times", "exact_allocation", "find_sync", "graph_ms", "peak_mib", "place_of", "repeat"]
 

@@ -1,4 +1,4 @@
-"""The process in which cases are measured: `python -m tuning.bench_child < job.json`.
+"""The process in which cases are measured: `python -m tuning.bench.child < job.json`.
 
 It gets a job on its standard input, and writes a line for each thing that it finds out, so that
 nothing is lost if it dies: torch's compiler and CUDA graphs may end a process.
@@ -18,10 +18,10 @@ from pydantic import Field
 
 from torchblur.ops.compiling import compiler_works
 from torchblur.params import Config
-from tuning.bench_cases import Case
-from tuning.bench_measure import Times, exact_allocation, find_sync, graph_ms, peak_mib, repeat
-from tuning.bench_step import Step, median_parts, render_parts
-from tuning.bench_work import make_call
+from tuning.bench.calls import make_call
+from tuning.bench.cases import Case
+from tuning.bench.fit_step import Step, median_parts, render_parts
+from tuning.bench.measure import Times, exact_allocation, find_sync, graph_ms, peak_mib, repeat
 
 __all__ = ["MARK", "BenchJob", "run_job"]
 

@@ -14,8 +14,8 @@ from torchblur.filters import BlurFilter, TemporalBlur
 from torchblur.frame import Frame, Shutter
 from torchblur.metrics import FlipReference, prepare_flip_ldr
 from torchblur.render import Renderer, load_scene
-from tuning.bench_cases import Case
-from tuning.bench_work import bench_frame, make_filter
+from tuning.bench.calls import bench_frame, make_filter
+from tuning.bench.cases import Case
 from tuning.render.scene import find_scene
 
 __all__ = ["METRIC_PARTS", "RENDER_SCENE", "STEP_PARTS", "Step", "median_parts", "render_parts"]

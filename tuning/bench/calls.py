@@ -15,7 +15,7 @@ from torchblur.filters import BlurFilter, History, TemporalBlur
 from torchblur.frame import Frame
 from torchblur.params import declared
 from torchblur.presets import create_filter
-from tuning.bench_cases import Case
+from tuning.bench.cases import Case
 
 __all__ = ["bench_frame", "has_taps", "make_call", "make_filter", "refuse_unknown", "sets_of"]
 
