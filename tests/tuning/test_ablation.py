@@ -13,7 +13,7 @@ from torchblur.errors import ConfigError, OutputError
 from torchblur.filters import get_filter
 from torchblur.io import write_frame, write_image
 from torchblur.metrics import evaluate
-from tuning.commands import app
+from tuning.cli.app import app
 from tuning.experiments.ablation.run import (
     AblationConfig,
     load_ablation_config,

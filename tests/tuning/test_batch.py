@@ -17,7 +17,7 @@ from torchblur.errors import ConfigError, FileFormatError, OutputError
 from torchblur.io import read_channels, read_exr, read_frame, read_image, save_yaml, write_frame
 from torchblur.presets import Preset, create_filter, save_preset
 from tuning.batch.run import BatchConfig, load_batch_config, plan_batch, run_batch
-from tuning.commands import app
+from tuning.cli.app import app
 
 
 @pytest.fixture

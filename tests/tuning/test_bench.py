@@ -17,7 +17,7 @@ from tuning.bench.child import MARK, BenchJob, run_job
 from tuning.bench.measure import Times
 from tuning.bench.plan import TABLES, BenchOptions, plan_tables, unique_cases
 from tuning.bench.run import Limits, check_output, measure_cases, run_bench
-from tuning.commands import app
+from tuning.cli.app import app
 
 TINY = Case(filter="line", width=24, height=16, num_samples=3)
 

@@ -3,7 +3,7 @@
 import pytest
 
 from tuning.bench.cases import Case, LinearFit, Report, Row, Table, TargetRow
-from tuning.bench_table import print_report
+from tuning.cli.bench_table import print_report
 
 TINY = Case(filter="line", width=24, height=16, num_samples=3)
 

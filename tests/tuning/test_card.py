@@ -17,7 +17,7 @@ from torchblur.presets import load_preset
 from tuning.cards.picture import card_picture
 from tuning.cards.text import Card, card_text
 from tuning.cards.write import write_cards
-from tuning.commands import app
+from tuning.cli.app import app
 from tuning.config.fit import TuneConfig, load_tune_config
 from tuning.data.loading import load_cases
 from tuning.fit.run import run_fit

@@ -27,7 +27,7 @@ from torchblur.metrics import border_band, display_encode, evaluate
 from torchblur.params import declared
 from torchblur.presets import Preset, create_filter, save_preset
 from torchblur.render import load_scene, render_frame, render_reference
-from tuning.commands import app
+from tuning.cli.app import app
 
 COMMANDS = (
     "tune",
@@ -91,7 +91,7 @@ class TestHelp:
         assert flags & {n.replace("_", "-") for n in parameters} == others.get(name, set())
 
     def test_needs_no_torch(self):
-        code = "import sys, tuning.commands; sys.exit('torch' in sys.modules)"
+        code = "import sys, tuning.cli.app; sys.exit('torch' in sys.modules)"
         assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
 
     def test_version(self):

@@ -15,7 +15,7 @@ from tiny_shots import (
 from typer.testing import CliRunner
 
 from torchblur.io import save_yaml, write_frame, write_image
-from tuning.commands import app
+from tuning.cli.app import app
 
 
 @pytest.fixture(autouse=True)

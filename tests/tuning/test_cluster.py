@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 
 import tuning.parallel.cluster
 from torchblur.errors import ConfigError
-from tuning.commands import app
+from tuning.cli.app import app
 from tuning.parallel.cluster import ClusterError, open_cluster
 
 

@@ -17,7 +17,7 @@ from torchblur.presets import Preset, save_preset
 from tuning.batch.cluster import _collect, _make, _Order, _Told
 from tuning.batch.run import BatchConfig, plan_batch, run_batch
 from tuning.batch.threads import Task
-from tuning.commands import app
+from tuning.cli.app import app
 from tuning.files.outputs import Job
 from tuning.parallel.cluster import ClusterError, Lost, open_cluster
 

@@ -14,7 +14,7 @@ from torchblur.errors import FrameError, OutputError
 from torchblur.frame import Shutter
 from torchblur.io import read_image, write_frame, write_image
 from torchblur.metrics import border_band, evaluate
-from tuning.commands import app
+from tuning.cli.app import app
 from tuning.files.images import read_color, read_metadata, write_color
 from tuning.report.compare import compare_images, short_names, write_page
 

@@ -12,7 +12,7 @@ from torchblur.frame import Shutter
 from torchblur.io import read_frame, read_image, write_image
 from torchblur.metrics import border_band, evaluate, flip_ldr, temporal_errors
 from torchblur.metrics.pooling import weighted_median
-from tuning.commands import app
+from tuning.cli.app import app
 from tuning.report.compare_sequences import compare_sequences, is_sequence
 
 NUMBERS = (1, 2, 3, 4)

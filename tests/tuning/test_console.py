@@ -3,8 +3,8 @@
 import pytest
 from rich.console import Console
 
-from tuning import console
-from tuning.console import metrics_table, number_text
+from tuning.cli import console
+from tuning.cli.console import metrics_table, number_text
 from tuning.progress import ProgressEvent
 
 

@@ -20,7 +20,7 @@ from torchblur.frame import Shutter
 from torchblur.io import load_yaml, read_frame, read_image, save_yaml, write_frame, write_image
 from torchblur.metrics import border_band, evaluate
 from torchblur.params import build
-from tuning.commands import app
+from tuning.cli.app import app
 from tuning.config.fit import TuneConfig
 from tuning.experiments.crossfit.bootstrap import (
     GAINS,

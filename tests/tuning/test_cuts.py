@@ -14,10 +14,10 @@ from torchblur.frame import Shutter
 from torchblur.params import build
 from torchblur.presets import load_preset
 from tuning.cards.text import Card, card_text
+from tuning.cli.printing import print_fit
 from tuning.config.fit import TuneConfig, load_tune_config
 from tuning.data.variants import Variant, cut_of
 from tuning.fit.run import run_fit
-from tuning.printing import print_fit
 from tuning.results.cuts import Cuts, cuts_over
 from tuning.results.fit import CaseScore, FitResult, cut_text
 from tuning.scoring.cases import score_variant

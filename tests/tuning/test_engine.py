@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 from torchblur.filters import get_filter
 from torchblur.io import load_yaml, save_yaml
 from torchblur.ops import compiling
-from tuning.commands import app
+from tuning.cli.app import app
 from tuning.config.fit import TuneConfig, resolve
 from tuning.files.outputs import Job
 from tuning.objective.engine import files_engine, fit_engine

@@ -9,7 +9,7 @@ from typer.testing import CliRunner
 
 from torchblur.frame import Frame
 from torchblur.presets import create_filter, load_preset
-from tuning.commands import app
+from tuning.cli.app import app
 
 
 @pytest.fixture(autouse=True)

@@ -6,7 +6,7 @@ from typer.testing import CliRunner
 from torchblur.io import read_frame, read_image
 from torchblur.params import build
 from torchblur.render import draw_scene, load_family, load_scene, render_frame, render_reference
-from tuning.commands import app
+from tuning.cli.app import app
 from tuning.config.data import DataSpec
 from tuning.data.loading import load_cases
 

@@ -11,7 +11,7 @@ from torchblur.frame import Shutter
 from torchblur.io import read_frame, read_metadata
 from torchblur.params import build
 from torchblur.render import Scene, draw_scene, load_family, load_scene, render_frame
-from tuning.commands import app
+from tuning.cli.app import app
 from tuning.config.data import DataSpec, FamilyData, SceneData
 from tuning.data.framing import busiest_box
 from tuning.data.loading import load_cases

@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 import tuning.experiments.race.run
 from torchblur.errors import ConfigError
 from torchblur.io import save_yaml
-from tuning.commands import app
+from tuning.cli.app import app
 from tuning.experiments.race.config import load_race_config
 from tuning.experiments.race.run import Curve, Point, _best_by, _Event, grid, run_race
 from tuning.experiments.race.summary import at, median_curve, standings, target_of

@@ -7,7 +7,7 @@ from typer.testing import CliRunner
 from torchblur.frame import Shutter
 from torchblur.io import find_frames, inspect_file, read_frame, read_image, read_sequence
 from torchblur.render import load_scene, render_frame, render_reference, render_stream
-from tuning.commands import app
+from tuning.cli.app import app
 
 runner = CliRunner()
 

@@ -21,7 +21,7 @@ from torchblur.io import read_frame, read_image, save_yaml, write_frame, write_i
 from torchblur.metrics import evaluate, temporal_errors
 from tuning.batch.run import BatchConfig, plan_batch, run_batch
 from tuning.batch.single import filter_files, load_settings, plan_files
-from tuning.commands import app
+from tuning.cli.app import app
 from tuning.files.frame_numbers import shots_of
 from tuning.files.outputs import Job
 

@@ -17,7 +17,7 @@ from torchblur.metrics import flip_ldr, prepare_flip_ldr, psnr, ssim
 from torchblur.metrics.pooling import weighted_median
 from torchblur.metrics.temporal import temporal_error
 from torchblur.render import load_scene, render_reference, render_revealed, render_stream
-from tuning.commands import app
+from tuning.cli.app import app
 from tuning.experiments.study.config import load_study_config
 from tuning.experiments.study.frames import Moment, moments
 from tuning.experiments.study.ray_mask import ray_mask_of

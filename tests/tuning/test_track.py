@@ -13,7 +13,7 @@ from torchblur.errors import ConfigError
 from torchblur.filters import get_filter
 from torchblur.io import save_yaml
 from torchblur.params import build
-from tuning.commands import app
+from tuning.cli.app import app
 from tuning.config.fit import TuneConfig
 from tuning.fit.run import run_fit
 from tuning.fit.tensorboard import Tracker, tracking

@@ -7,13 +7,13 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from tuning.console import results
-from tuning.options import Overwrite, Set
+from tuning.cli.console import results, show_progress
+from tuning.cli.options import Overwrite, Set
 
 if TYPE_CHECKING:
     from torchblur.presets import Preset
 
-__all__ = ["export"]
+__all__ = ["card", "export"]
 
 _ENDINGS = {
     ".json": "json",
@@ -128,3 +128,29 @@ def _write_program(
     blur = get_filter(preset.filter)(None, engine="eager", **preset.params)
     notes = {"torchblur.json": constants_text(preset, "json", name=name)}
     save_program(output, export_program(blur, frame), notes=notes, overwrite=overwrite)
+
+
+def card(
+    runs: Annotated[list[Path], typer.Argument(metavar="RUN", help="Folders of finished fits.")],
+    output: Annotated[
+        Path, typer.Option("-o", "--output", metavar="DIR", help="Folder of the cards.")
+    ] = Path("cards"),
+    presets: Annotated[
+        Path | None,
+        typer.Option(metavar="DIR", help="Put the presets there too, as FILTER-tuned.yaml …"),
+    ] = None,
+    overwrite: Overwrite = False,
+) -> None:
+    """Write a card for each preset of a fit: before and after, and where it is worse.
+
+    A card is a Markdown file with a picture. A run with quality levels gives one for each level.
+    """
+    from tuning.cards.write import write_cards
+
+    for run in runs:
+        with show_progress() as progress:
+            files = write_cards(
+                run, output, presets_dir=presets, overwrite=overwrite, progress=progress
+            )
+        for file in files:
+            results.print(f"wrote {file}", soft_wrap=True)

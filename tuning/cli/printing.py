@@ -17,7 +17,7 @@ from torchblur.io import Inspection
 from torchblur.io.inspect import ChannelInfo
 from torchblur.params import Param, choices, declared
 from tuning.batch.run import BatchResult, Plan
-from tuning.console import (
+from tuning.cli.console import (
     log,
     metrics_table,
     number_text,
@@ -26,10 +26,11 @@ from tuning.console import (
     print_warning,
     results,
 )
+from tuning.cli.reach_advice import SHUTTER, reach_advice
 from tuning.experiments.ablation.run import AblationConfig, Measured
 from tuning.experiments.ablation.write import RULE, tally
+from tuning.experiments.study.run import FACTS, Row
 from tuning.files.outputs import State
-from tuning.reach_advice import SHUTTER, reach_advice
 from tuning.report.front import preset_names
 from tuning.results.fit import FitResult, cut_text, height_name
 
@@ -40,6 +41,7 @@ __all__ = [
     "print_inspection",
     "print_parameters",
     "print_plan",
+    "print_study",
     "schema_text",
 ]
 
@@ -297,3 +299,20 @@ def print_ablation(config: AblationConfig, rows: Sequence[Measured]) -> None:
 def _figure(metric: str, scores: Mapping[str, float | None]) -> str:
     value = scores.get(f"{metric}_band")
     return number_text(metric, float("nan") if value is None else value)
+
+
+def print_study(rows: Sequence[Row]) -> None:
+    """Print FLIP, PSNR and SSIM of all variants, a table for each data and reference."""
+    rows = [row for row in rows if row.variant != FACTS]
+    for data, reference in dict.fromkeys((row.data, row.reference) for row in rows):
+        table = {
+            row.variant: _row_means(row)
+            for row in rows
+            if (row.data, row.reference) == (data, reference)
+        }
+        results.print(metrics_table(f"{data}, {reference}", table))
+
+
+def _row_means(row: Row) -> dict[str, float]:
+    means = {key: row.mean(key) for key in ("flip", "flip_median", "psnr", "ssim")}
+    return {key: float("nan") if value is None else value for key, value in means.items()}

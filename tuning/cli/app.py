@@ -16,15 +16,12 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from typer.core import TyperGroup
 
-from tuning.bench_command import bench
-from tuning.card_command import card
-from tuning.console import metrics_table, print_error, print_warning, results, show_progress
-from tuning.crossfit_command import crossfit
-from tuning.evidence_commands import ablate, study
-from tuning.export_command import export
-from tuning.options import ConventionName, NoCompile, Overwrite, Scheduler, Set
-from tuning.race_command import race
-from tuning.render_command import render
+from tuning.cli.bench import bench
+from tuning.cli.console import metrics_table, print_error, print_warning, results, show_progress
+from tuning.cli.experiments import ablate, crossfit, race, study
+from tuning.cli.export import card, export
+from tuning.cli.options import ConventionName, NoCompile, Overwrite, Scheduler, Set
+from tuning.cli.render import render
 
 if TYPE_CHECKING:
     from tuning.parallel.cluster import Cluster
@@ -168,11 +165,11 @@ def tune(  # noqa: PLR0913 - each argument is an option
     a report with the evidence. A cluster takes the candidates that a search draws together
     (`population`); `torchrun -m tuning tune CONFIG` splits the windows of each step.
     """
+    from tuning.cli.printing import print_fit
     from tuning.config.fit import load_tune_config
     from tuning.fit.run import run_fit
     from tuning.fit.tensorboard import tracking
     from tuning.parallel.ranks import RankZeroStoppedError, rank_here
-    from tuning.printing import print_fit
 
     overrides = [*(set_ or []), *([f"device={device}"] if device else [])]
     overrides += ["engine=eager"] if no_compile else []
@@ -273,7 +270,7 @@ def batch(
 ) -> None:
     """Filter many frames; what is done is skipped, so a stopped run goes on when started again."""
     from tuning.batch.run import load_batch_config, plan_batch, run_batch
-    from tuning.printing import print_batch, print_plan
+    from tuning.cli.printing import print_batch, print_plan
 
     overrides = [*(set_ or []), *([f"workers={workers}"] if workers is not None else [])]
     plan = plan_batch(load_batch_config(config, overrides), overwrite=overwrite)
@@ -357,7 +354,7 @@ def params(
     ] = False,
 ) -> None:
     """List the parameters of a filter: default, range, unit, gradient class, source, meaning."""
-    from tuning.printing import print_parameters, schema_text
+    from tuning.cli.printing import print_parameters, schema_text
 
     if json_schema:
         typer.echo(schema_text(filter_name))
@@ -378,7 +375,7 @@ def inspect(
 ) -> None:
     """Show what is in a file, how it would be read, and what looks wrong."""
     from torchblur.io import inspect_file
-    from tuning.printing import print_inspection
+    from tuning.cli.printing import print_inspection
 
     print_inspection(inspect_file(file, reference, convention=convention))
 

@@ -7,8 +7,8 @@ from typing import Annotated
 
 import typer
 
-from tuning.console import print_error, results, show_progress
-from tuning.options import NoCompile, Overwrite
+from tuning.cli.console import print_error, results, show_progress
+from tuning.cli.options import NoCompile, Overwrite
 
 __all__ = ["render"]
 

@@ -1,4 +1,4 @@
-"""Entry point of the command `torchblur`.
+"""The commands of `torchblur`, and its entry point.
 
 It imports nothing but the standard library, so that a missing package is one clear sentence.
 """
@@ -18,7 +18,7 @@ def main() -> None:
     # Torch's large allocations then take huge pages, which costs half the time.
     os.environ.setdefault("THP_MEM_ALLOC_ENABLE", "1")
     try:
-        from tuning.commands import app
+        from tuning.cli.app import app
     except ModuleNotFoundError as error:
         if error.name not in _NEEDED:
             raise

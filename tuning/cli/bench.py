@@ -8,8 +8,8 @@ from typing import Annotated, Any
 
 import typer
 
-from tuning.console import print_error, print_warning, results, show_progress
-from tuning.options import Overwrite, Set
+from tuning.cli.console import print_error, print_warning, results, show_progress
+from tuning.cli.options import Overwrite, Set
 
 __all__ = ["bench"]
 
@@ -83,7 +83,7 @@ def bench(  # noqa: PLR0913 - each argument is an option
     from tuning.bench.cases import Report
     from tuning.bench.plan import BenchOptions
     from tuning.bench.run import run_bench
-    from tuning.bench_table import print_report
+    from tuning.cli.bench_table import print_report
     from tuning.config.overrides import apply_overrides
 
     if json_schema:

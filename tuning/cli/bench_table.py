@@ -9,7 +9,7 @@ from rich.text import Text
 from tuning.bench.cases import LinearFit, Report, Row, Table, TargetRow, cost_of
 from tuning.bench.fit_step import METRIC_PARTS, RENDER_SCENE, STEP_PARTS
 from tuning.bench.targets import KNOWN
-from tuning.console import plain_table, print_error, print_warning, results
+from tuning.cli.console import plain_table, print_error, print_warning, results
 
 __all__ = ["print_report"]
 
