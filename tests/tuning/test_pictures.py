@@ -1,6 +1,6 @@
 import pytest
 
-from tuning.pictures import one_sample_per_pixel, tuned_beside_published, what_lies_behind
+from tools.readme_images import one_sample_per_pixel, tuned_beside_published, what_lies_behind
 
 
 @pytest.mark.parametrize(

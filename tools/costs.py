@@ -1,4 +1,4 @@
-"""What filters and presets cost at four heights: ``python -m tuning.costs [FILE]``.
+"""What filters and presets cost at four heights: ``python -m tools.costs [FILE]``.
 
 One scene, the whole image, CPU-seconds of one call on one thread, the median of three; eager.
 """
@@ -77,7 +77,7 @@ def table(costs: dict[str, list[list[float]]]) -> str:
     lines = [
         "# Cost at four heights",
         "",
-        "Made by `python -m tuning.costs`: CPU-seconds of one eager call on one thread, median of",
+        "Made by `python -m tools.costs`: CPU-seconds of one eager call on one thread, median of",
         f"{_RUNS}; the whole image of crossing_spheres. Long / short: half spreads of up to 17 px",
         "at 270 lines, 35, 69 and 138 px at the others; and a tenth of that.",
         "",

@@ -1,4 +1,4 @@
-"""Must parameters in pixels follow the frame's height? ``python -m tuning.sizes [FILE]``.
+"""Must parameters in pixels follow the frame's height? ``python -m tools.sizes [FILE]``.
 
 Two scenes are rendered by cameras of 270 to 2160 lines, the same part of the image of each. Every
 parameter in pixels of every filter is halved and doubled, all else left as it is. Where one value
@@ -152,7 +152,7 @@ def table(found: list[Row]) -> str:
     lines = [
         "# Parameters in pixels, at four heights",
         "",
-        "Made by `python -m tuning.sizes`. FLIP for half the default, the default and twice the",
+        "Made by `python -m tools.sizes`. FLIP for half the default, the default and twice the",
         "default, mean over the middle quarter of two scenes (crossing_spheres and everyday-0009),",
         "rendered by cameras of four heights; shutter 0.3, `reach: frame`. The last column: by how",
         "much the best single factor is worse than the best one at some height. Near 0 the",

@@ -1,4 +1,4 @@
-"""Make the pictures of the README: ``python -m tuning.pictures [FOLDER]`` (docs/images)."""
+"""Make the pictures of the README: ``python -m tools.readme_images [FOLDER]`` (docs/images)."""
 
 from __future__ import annotations
 
