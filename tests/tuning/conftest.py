@@ -8,7 +8,7 @@ from planted_sequences import Recall
 
 import torchblur.filters.base
 from torchblur.filters import get_filter
-from tuning.config.fit import ObjectiveSpec
+from tuning.config.objective import ObjectiveSpec
 from tuning.objective.problem import Problem
 from tuning.objective.windows import make_samples
 

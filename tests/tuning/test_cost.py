@@ -9,7 +9,7 @@ from torchblur.filters import BlurFilter, get_filter, registered_filters
 from torchblur.filters.base import FilterConfig
 from torchblur.params import declared
 from tuning.config.cost import Cost, cost_at, cost_of
-from tuning.config.fit import ObjectiveSpec
+from tuning.config.objective import ObjectiveSpec
 from tuning.objective.problem import Problem
 from tuning.objective.windows import make_samples
 

@@ -14,9 +14,10 @@ from torchblur.errors import ConfigError, FileFormatError
 from torchblur.filters import get_filter
 from torchblur.frame import Shutter
 from torchblur.io import write_frame, write_image
+from torchblur.ops.compiling import cache_folder
 from torchblur.params import build
 from tuning.config.data import Crops, DataSpec
-from tuning.data.loading import cache_folder, load_cases
+from tuning.data.loading import load_cases
 from tuning.objective.windows import make_samples
 
 SCENE = """

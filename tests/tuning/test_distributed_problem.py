@@ -6,7 +6,7 @@ from planted import FIXED, planted_case
 from planted_sequences import sequence_case
 
 from torchblur.filters import get_filter
-from tuning.config.fit import ObjectiveSpec
+from tuning.config.objective import ObjectiveSpec
 from tuning.objective.problem import Problem
 from tuning.objective.windows import make_samples
 from tuning.parallel.sharded_problem import Shard, ShardedProblem

@@ -13,11 +13,13 @@ from torchblur.io import load_yaml, read_frame, read_image
 from torchblur.metrics import psnr
 from torchblur.params import build
 from torchblur.presets import create_filter, load_preset
-from tuning.config.fit import BlackBoxMethod, FilterSpec, GradientMethod, TuneConfig
+from tuning.config.fit import FilterSpec, TuneConfig
+from tuning.config.methods import BlackBoxMethod, GradientMethod
 from tuning.data.blurring import blurred
 from tuning.fit.run import run_fit
 from tuning.methods.blackbox import BlackBoxJob, fit_blackbox
-from tuning.methods.gradient import FitError, GradientJob, fit_gradient
+from tuning.methods.gradient import fit_gradient
+from tuning.methods.gradient_state import FitError, GradientJob
 from tuning.objective.sensitivity import sensitivities
 from tuning.objective.space import make_space
 from tuning.results.fit import FitResult

@@ -14,8 +14,8 @@ from torchblur.params import build
 from tuning.config.fit import FilterSpec, TuneConfig, resolve
 from tuning.config.methods import GradientMethod
 from tuning.files.run_folder import RunFolder
-from tuning.methods.gradient import FitError, GradientJob, fit_gradient
-from tuning.methods.gradient_state import losses_and_slopes
+from tuning.methods.gradient import fit_gradient
+from tuning.methods.gradient_state import FitError, GradientJob, losses_and_slopes
 from tuning.methods.lbfgs import LbfgsState
 from tuning.objective.batches import FrameGroup
 from tuning.objective.problem import Problem

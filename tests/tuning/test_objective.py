@@ -10,7 +10,7 @@ from planted import FIXED, PLANTED, planted_case, tiny_frame
 from torchblur.filters import get_filter
 from torchblur.metrics import flip_hdr, flip_ldr, ssim
 from tuning.config.data import Crops
-from tuning.config.fit import ObjectiveSpec
+from tuning.config.objective import ObjectiveSpec
 from tuning.data.blurring import blurred
 from tuning.objective.problem import Problem
 from tuning.objective.terms import prepare_objective

@@ -11,7 +11,7 @@ from tuning.config.cost import cost_of
 from tuning.config.fit import FilterSpec
 from tuning.config.methods import ParetoMethod, PolishSteps
 from tuning.files.run_folder import RunFolder
-from tuning.methods.gradient import FitError
+from tuning.methods.gradient_state import FitError
 from tuning.methods.pareto import ParetoJob, fit_pareto
 from tuning.objective.space import make_space
 from tuning.results.front import ParetoPoint, front_of, pick

@@ -6,7 +6,7 @@ from planted import FIXED, PLANTED, planted_case
 
 from torchblur.filters import get_filter
 from tuning.config.data import Crops
-from tuning.config.fit import ObjectiveSpec
+from tuning.config.objective import ObjectiveSpec
 from tuning.objective.problem import Problem
 from tuning.objective.terms import tail_weights
 from tuning.objective.windows import make_samples

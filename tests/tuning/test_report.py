@@ -15,7 +15,8 @@ from planted import planted_case, write_planted
 from torchblur.metrics import flip_ldr
 from torchblur.params import build
 from tuning.cli.printing import print_fit
-from tuning.config.fit import ObjectiveSpec, TuneConfig
+from tuning.config.fit import TuneConfig
+from tuning.config.objective import ObjectiveSpec
 from tuning.fit.run import run_fit
 from tuning.report.evidence import evidence_of
 from tuning.report.fit import figures_table, figures_tables, verdict_of

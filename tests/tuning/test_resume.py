@@ -14,7 +14,8 @@ import tuning.fit.run
 from torchblur.errors import OutputError
 from torchblur.io import save_yaml
 from torchblur.params import build
-from tuning.config.fit import BlackBoxMethod, FilterSpec, TuneConfig, load_tune_config
+from tuning.config.fit import FilterSpec, TuneConfig, load_tune_config
+from tuning.config.methods import BlackBoxMethod
 from tuning.files.run_folder import RunFolder, open_run, trim_torn_line
 from tuning.fit.run import run_fit
 from tuning.methods.blackbox import BlackBoxJob, fit_blackbox

@@ -16,12 +16,15 @@ from torchblur.metrics import flip_ldr, temporal_errors
 from torchblur.metrics.pooling import weighted_median
 from torchblur.params import build
 from tuning.config.data import Crops
-from tuning.config.fit import BlackBoxMethod, FilterSpec, GradientMethod, ObjectiveSpec, TuneConfig
+from tuning.config.fit import FilterSpec, TuneConfig
+from tuning.config.methods import BlackBoxMethod, GradientMethod
+from tuning.config.objective import ObjectiveSpec
 from tuning.data.blurring import arguments, blurred_sequence
 from tuning.data.variants import Variant
 from tuning.fit.run import run_fit
 from tuning.methods.blackbox import BlackBoxJob, fit_blackbox
-from tuning.methods.gradient import FitError, GradientJob, fit_gradient
+from tuning.methods.gradient import fit_gradient
+from tuning.methods.gradient_state import FitError, GradientJob
 from tuning.objective.problem import Problem
 from tuning.objective.space import make_space
 from tuning.objective.windows import make_samples

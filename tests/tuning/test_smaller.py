@@ -10,8 +10,9 @@ from planted_sequences import sequence_case
 from torchblur.filters import get_filter
 from torchblur.params import build
 from tuning.config.data import Crops
-from tuning.config.fit import ObjectiveSpec, TuneConfig, resolve
+from tuning.config.fit import TuneConfig, resolve
 from tuning.config.methods import PruningSpec
+from tuning.config.objective import ObjectiveSpec
 from tuning.methods.pruning import Ladder, rung_sizes
 from tuning.objective.batches import FrameGroup
 from tuning.objective.cropping import pixels_of, smaller

@@ -24,7 +24,7 @@ from torchblur.params import build
 from tuning.batch.apply import FilterSettings, make_filter, recipe_of, samples_beside
 from tuning.batch.cluster import run_on_cluster
 from tuning.batch.threads import Runner, Task
-from tuning.config.fit import apply_overrides
+from tuning.config.overrides import apply_overrides
 from tuning.files.frame_numbers import shots_of
 from tuning.files.outputs import (
     Job,

@@ -23,7 +23,7 @@ from tuning.batch.apply import (
     samples_beside,
     write_job,
 )
-from tuning.config.fit import apply_overrides
+from tuning.config.overrides import apply_overrides
 from tuning.files.frame_numbers import shots_of
 from tuning.files.images import read_color
 from tuning.files.outputs import Job, find_inputs, make_folders, name_outputs, numbered

@@ -21,25 +21,14 @@ from torchblur.params import Config, build, choices, declared
 from torchblur.presets import load_preset
 from tuning.config.cost_limits import check_costs
 from tuning.config.data import DataSpec
-from tuning.config.methods import (
-    BlackBoxMethod,
-    GradientMethod,
-    Method,
-    check_method,
-    check_refresh,
-)
+from tuning.config.methods import GradientMethod, Method, check_method, check_refresh
 from tuning.config.objective import ObjectiveSpec
 from tuning.config.overrides import apply_overrides
 
 __all__ = [
-    "BlackBoxMethod",
     "FilterSpec",
     "FreeRange",
-    "GradientMethod",
-    "Method",
-    "ObjectiveSpec",
     "TuneConfig",
-    "apply_overrides",
     "free_names",
     "load_tune_config",
     "resolve",

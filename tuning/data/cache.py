@@ -18,7 +18,7 @@ from torchblur.frame import Frame
 from torchblur.ops.compiling import cache_folder
 from torchblur.render import load_scene
 
-__all__ = ["cache_folder", "cache_key", "cached", "frame_of", "hash_scene", "planes_of"]
+__all__ = ["cache_key", "cached", "frame_of", "hash_scene", "planes_of"]
 
 
 def cached(key: str, make: Callable[[], dict[str, Tensor]]) -> dict[str, Tensor]:

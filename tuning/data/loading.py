@@ -26,14 +26,14 @@ from tuning.config.data import (
     SceneData,
     SceneStreamData,
 )
-from tuning.data.cache import cache_folder, cache_key, cached, frame_of, planes_of
-from tuning.data.cases import AnyCase, Case, SequenceCase, refuse_repeats, with_unique_names
+from tuning.data.cache import cache_key, cached, frame_of, planes_of
+from tuning.data.cases import AnyCase, Case, refuse_repeats, with_unique_names
 from tuning.data.families import drawn_scenes
 from tuning.data.framing import cached_box, seen_through, view_of
 from tuning.data.streams import ExrStreamJob, SceneStreamJob
 from tuning.files.frame_numbers import frame_numbers, numbered_file
 
-__all__ = ["Case", "SequenceCase", "cache_folder", "draw_cases", "load_cases"]
+__all__ = ["draw_cases", "load_cases"]
 
 
 def load_cases(

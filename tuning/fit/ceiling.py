@@ -9,7 +9,8 @@ from torchblur.filters import BlurFilter
 from tuning.config.methods import GradientMethod
 from tuning.config.objective import ObjectiveSpec
 from tuning.data.cases import AnyCase
-from tuning.methods.gradient import GradientJob, fit_gradient
+from tuning.methods.gradient import fit_gradient
+from tuning.methods.gradient_state import GradientJob
 from tuning.objective.problem import Problem
 from tuning.objective.space import Space
 from tuning.objective.windows import make_samples

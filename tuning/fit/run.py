@@ -16,7 +16,8 @@ from typing import Any
 
 from torchblur.filters import BlurFilter, get_filter
 from torchblur.presets import Preset, save_preset
-from tuning.config.fit import GradientMethod, TuneConfig, resolve
+from tuning.config.fit import TuneConfig, resolve
+from tuning.config.methods import GradientMethod
 from tuning.data.cases import AnyCase, SequenceCase
 from tuning.data.variants import Variant
 from tuning.files.run_folder import RunFolder, open_run

@@ -23,7 +23,7 @@ from optuna.trial import FrozenTrial, Trial, TrialState, create_trial
 
 from tuning.config.methods import BlackBoxMethod
 from tuning.files.run_folder import RunFolder
-from tuning.methods.gradient import FitError, seed_of
+from tuning.methods.gradient_state import FitError, seed_of
 from tuning.methods.job import MethodJob
 from tuning.methods.polish import Polished, PolishStart, is_promising, polish
 from tuning.methods.pruning import Climb, Ladder

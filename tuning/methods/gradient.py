@@ -20,7 +20,6 @@ from tuning.methods.gradient_state import (
     State,
     finite_or_none,
     scalars,
-    seed_of,
 )
 from tuning.methods.lbfgs import LbfgsState
 from tuning.methods.scene_pool import Pool
@@ -28,7 +27,7 @@ from tuning.objective.problem import Problem
 from tuning.progress import Progress, Stage
 from tuning.results.fit import MethodResult, StartResult
 
-__all__ = ["FitError", "GradientJob", "fit_gradient", "seed_of"]
+__all__ = ["fit_gradient"]
 
 
 def fit_gradient(

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from torchblur.errors import TorchblurError
-from tuning.config.fit import GradientMethod
+from tuning.config.methods import GradientMethod
 from tuning.methods.job import MethodJob
 from tuning.objective.problem import Problem
 from tuning.objective.space import Space

@@ -23,7 +23,7 @@ from optuna.trial import FrozenTrial, Trial, TrialState, create_trial
 from tuning.config.cost import cost_at
 from tuning.config.methods import ParetoMethod
 from tuning.files.run_folder import RunFolder
-from tuning.methods.gradient import FitError, seed_of
+from tuning.methods.gradient_state import FitError, seed_of
 from tuning.methods.job import MethodJob
 from tuning.methods.polish import Polished, PolishStart, polish
 from tuning.methods.search import new_study, run_rounds, suggest

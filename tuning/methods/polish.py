@@ -14,7 +14,8 @@ from dataclasses import dataclass
 from typing import Any
 
 from tuning.config.methods import GradientMethod, PolishSteps
-from tuning.methods.gradient import FitError, GradientJob, fit_gradient
+from tuning.methods.gradient import fit_gradient
+from tuning.methods.gradient_state import FitError, GradientJob
 from tuning.objective.problem import Problem
 from tuning.objective.space import Space
 

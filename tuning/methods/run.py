@@ -10,7 +10,8 @@ from tuning.config.fit import TuneConfig, free_names
 from tuning.config.methods import GradientMethod, ParetoMethod, polished_names
 from tuning.files.run_folder import RunFolder
 from tuning.methods.blackbox import BlackBoxJob, fit_blackbox
-from tuning.methods.gradient import GradientJob, fit_gradient, seed_of
+from tuning.methods.gradient import fit_gradient
+from tuning.methods.gradient_state import GradientJob, seed_of
 from tuning.methods.pareto import ParetoJob, fit_pareto
 from tuning.methods.scene_pool import Pool
 from tuning.objective.problem import Problem

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from torchblur.filters import BlurFilter
 from torchblur.frame import Frame
-from tuning.config.fit import ObjectiveSpec
+from tuning.config.objective import ObjectiveSpec
 from tuning.data.blurring import arguments, blurred, blurred_sequence
 from tuning.objective.cpu_time import Meter
 from tuning.objective.terms import PreparedObjective, prepare_objective
