@@ -23,7 +23,7 @@ from tuning.objective.prepare import prepare
 from tuning.objective.windows import make_samples
 from tuning.parallel.sharded_problem import ShardedProblem
 
-CONFIGS = Path(__file__).parents[2] / "configs"
+CONFIGS = Path(__file__).parents[3] / "configs"
 TINY = {"size": "48x28", "spp": 4, "color_spp": 2}
 FAMILY = {"kind": "family", "path": "families/everyday.yaml", "scenes": 3, "seed": 7} | TINY
 SCENE = {"kind": "scene", "path": "scenes/crossing_spheres.yaml"} | TINY
