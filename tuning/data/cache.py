@@ -13,10 +13,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
-import torchblur.render
 from torchblur.frame import Frame
 from torchblur.ops.compiling import cache_folder
 from torchblur.render import load_scene
+from tuning.files.source import source_hash
 
 __all__ = ["cache_key", "cached", "frame_of", "hash_scene", "planes_of"]
 
@@ -55,7 +55,9 @@ def cache_key(scene_key: str, settings: Mapping[str, Any], time: float) -> str:
         settings: All that the renderer is told, as plain data.
         time: The frame's time.
     """
-    parts = [scene_key, json.dumps(settings, sort_keys=True), repr(time), _renderer_hash()]
+    # Families are left out: what they draw is a scene, which has a hash of its own.
+    renderer = source_hash("render", without="family")
+    parts = [scene_key, json.dumps(settings, sort_keys=True), repr(time), renderer]
     return hashlib.sha256("\n".join(parts).encode()).hexdigest()[:32]
 
 
@@ -83,16 +85,3 @@ def frame_of(tensors: Mapping[str, Tensor], prefix: str, source: str) -> Frame:
         if name.startswith(f"{prefix}.")
     }
     return Frame(**layers, source=source)
-
-
-def _renderer_hash() -> str:
-    """Return the hash of the renderer's source: another renderer, another image.
-
-    Families are left out: what they draw is a scene, which has a hash of its own.
-    """
-    digest = hashlib.sha256()
-    for folder in torchblur.render.__path__:
-        for file in sorted(Path(folder).glob("*.py")):
-            if not file.name.startswith("family"):
-                digest.update(file.read_bytes())
-    return digest.hexdigest()

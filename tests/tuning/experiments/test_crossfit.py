@@ -453,7 +453,7 @@ class TestResume:
 
     def test_new_source_scores_anew_and_keeps_the_fits(self, finished, monkeypatch):
         monkeypatch.setattr(
-            tuning.experiments.crossfit.run, "source_hash", lambda: "another filter"
+            tuning.experiments.crossfit.run, "figures_hash", lambda: "another filter"
         )
         monkeypatch.setattr(tuning.experiments.crossfit.run, "prepare", None)
         scored, score = [], tuning.experiments.crossfit.run.tile_sums

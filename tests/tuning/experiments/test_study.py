@@ -156,7 +156,7 @@ class TestRun:
         edited(study, "{num_samples: 15}", "{num_samples: 9}")
         assert row_of(run_study(load_study_config(study), folder), "line") != row_of(first, "line")
         assert len(calls) == 2
-        monkeypatch.setattr(tuning.experiments.study.run, "source_hash", lambda: "another filter")
+        monkeypatch.setattr(tuning.experiments.study.run, "figures_hash", lambda: "another filter")
         run_study(config, folder)
         assert len(calls) == 3
 

@@ -7,7 +7,6 @@ goes on within the fit in flight; several processes may share the fits and find 
 from __future__ import annotations
 
 import dataclasses
-import hashlib
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import as_completed
@@ -27,7 +26,7 @@ from tuning.data.loading import load_cases
 from tuning.data.variants import Variant, cut_of
 from tuning.experiments.crossfit.bootstrap import Sums, tile_sums
 from tuning.experiments.crossfit.config import CrossfitConfig
-from tuning.experiments.study.run import slug, source_hash
+from tuning.experiments.kept import digest_of, figures_hash, slug
 from tuning.files.outputs import make_folders
 from tuning.files.run_folder import open_run
 from tuning.methods.run import run_methods
@@ -225,7 +224,7 @@ def _read_fold(path: Path) -> Fold:
 
 
 def _fold_path(folder: Path, name: str, case: str, fit: TuneConfig) -> Path:
-    digest = _digest(fit.model_dump(mode="json"), version("torchblur"))
+    digest = digest_of(fit.model_dump(mode="json"), version("torchblur"))
     return folder / "folds" / f"{slug(name)}.without-{slug(case)}.{digest}"
 
 
@@ -283,7 +282,7 @@ def _score_path(config: CrossfitConfig, folder: Path, shown: _Shown, case: str) 
     """Return a score's file; its name depends on all that its figures do, the source included."""
     parts = [shown.kind, dict(shown.params), list(shown.free), config.data.root]
     items = [item.model_dump(mode="json") for item in config.scored(case)]
-    digest = _digest(*parts, items, config.bootstrap.tile, source_hash())
+    digest = digest_of(*parts, items, config.bootstrap.tile, figures_hash())
     name = ".".join(slug(text) for text in (case, shown.filter, shown.variant) if text)
     return folder / "scores" / f"{name}.{digest}.json"
 
@@ -326,7 +325,3 @@ def _collected(config: CrossfitConfig, folder: Path) -> Crossfit:
             if found.heights:
                 scored.append(found)
     return Crossfit(tuple(folds.values()), tuple(scored))
-
-
-def _digest(*parts: Any) -> str:
-    return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()[:10]

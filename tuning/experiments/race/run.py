@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import bisect
 import dataclasses
-import hashlib
 import json
 import math
 from collections.abc import Iterator, Mapping, Sequence
@@ -23,8 +22,8 @@ from tuning.config.fit import TuneConfig, resolve
 from tuning.config.methods import GradientMethod
 from tuning.data.cases import AnyCase, Case
 from tuning.data.variants import Variant, render
+from tuning.experiments.kept import digest_of, slug
 from tuning.experiments.race.config import Entrant, RaceConfig, RaceProblem
-from tuning.experiments.study.run import slug
 from tuning.files.run_folder import RunFolder, open_run
 from tuning.methods.run import run_methods
 from tuning.objective.prepare import prepare
@@ -143,8 +142,7 @@ def grid(total: float) -> list[float]:
 
 def _name(problem: RaceProblem, entrant: Entrant, fit: TuneConfig) -> str:
     """Return the name of a fit's folder: of all that its figures depend on."""
-    parts = [fit.model_dump(mode="json"), problem.planted, version("torchblur")]
-    digest = hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()[:10]
+    digest = digest_of(fit.model_dump(mode="json"), problem.planted, version("torchblur"))
     return f"{slug(problem.name)}.{slug(entrant.name)}.{fit.seed}.{digest}"
 
 

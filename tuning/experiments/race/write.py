@@ -11,11 +11,11 @@ from importlib.metadata import version
 from pathlib import Path
 
 from torchblur.io.paths import output_file
+from tuning.experiments.kept import slug
 from tuning.experiments.race.config import RaceConfig, RaceProblem
 from tuning.experiments.race.plot import plot_race
 from tuning.experiments.race.run import Curve
 from tuning.experiments.race.summary import NEAR, Standing, standings
-from tuning.experiments.study.run import slug
 from tuning.files.outputs import make_folders
 
 __all__ = ["COLUMNS", "SHORT", "cells", "note_of", "write_race"]

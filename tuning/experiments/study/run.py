@@ -8,10 +8,8 @@ is kept per data and variant, so that a stopped study goes on where it was.
 from __future__ import annotations
 
 import dataclasses
-import functools
 import hashlib
 import json
-import re
 import statistics
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -21,12 +19,12 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-import torchblur
 from torchblur.errors import ConfigError, nearest_name
 from torchblur.filters import BlurFilter, History, TemporalBlur
 from torchblur.frame import Frame
 from torchblur.io.paths import output_file
 from torchblur.metrics import FlipReference, border_band, prepare_flip_ldr
+from tuning.experiments.kept import figures_hash, slug
 from tuning.experiments.study.config import (
     StudyConfig,
     StudyExr,
@@ -43,16 +41,7 @@ from tuning.progress import Progress, Stage
 FACTS = "ray mask"
 """Name of the variant that stands for figures of the data themselves."""
 
-__all__ = [
-    "FACTS",
-    "Row",
-    "mean_of",
-    "part_file",
-    "picture_file",
-    "run_study",
-    "slug",
-    "source_hash",
-]
+__all__ = ["FACTS", "Row", "mean_of", "part_file", "picture_file", "run_study"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -129,7 +118,7 @@ def part_file(
         variant.model_dump_json(exclude={"only"}),
         json.dumps([config.masks, config.mask_params], sort_keys=True),
         identity_of(item),
-        source_hash(),
+        figures_hash(),
     )
     digest = hashlib.sha256("\n".join(parts).encode()).hexdigest()[:16]
     return folder / "parts" / f"{slug(item.name)}.{slug(variant.name)}.{digest}.json"
@@ -289,24 +278,3 @@ def _told(layers: Mapping[str, Tensor]) -> dict[str, float | None]:
 def _show(path: Path, image: Tensor) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     write_color(path, image, overwrite=True)
-
-
-# -- names and hashes ------------------------------------------------------------------------------
-
-
-def slug(name: str) -> str:
-    """Return a name as part of a file's name."""
-    return re.sub(r"[^\w.+=-]+", "-", name).strip("-")
-
-
-@functools.cache
-def source_hash() -> str:
-    """Return a hash of the source of filters, metrics and renderer: what figures depend on."""
-    digest = hashlib.sha256()
-    root = Path(torchblur.__file__).parent
-    files = [*root.glob("*.py")]
-    for name in ("filters", "ops", "metrics", "render"):
-        files += (root / name).glob("*.py")
-    for file in sorted(files):
-        digest.update(file.read_bytes())
-    return digest.hexdigest()

@@ -14,9 +14,10 @@ from PIL import Image, ImageDraw, ImageFont
 
 from torchblur.errors import OutputError
 from torchblur.io.paths import output_file
+from tuning.experiments.kept import slug
 from tuning.experiments.study.config import StudyConfig, StudyExr, StudyScene
 from tuning.experiments.study.plot import plot_samples, plot_time
-from tuning.experiments.study.run import FACTS, Row, picture_file, slug
+from tuning.experiments.study.run import FACTS, Row, picture_file
 from tuning.experiments.study.scores import worth_of
 
 __all__ = ["check_study_outputs", "curve_of", "worth_table", "write_study"]
