@@ -36,11 +36,12 @@ def ablate(
     """
     from tuning.cli.printing import print_ablation
     from tuning.experiments.ablation.run import load_ablation_config, run_ablation
-    from tuning.experiments.ablation.write import check_outputs, write_ablation
+    from tuning.experiments.ablation.write import FILES, write_ablation
+    from tuning.experiments.tables import check_outputs
 
     folder = output or Path("runs") / config.stem
     loaded = load_ablation_config(config, set_ or [])
-    check_outputs(folder, overwrite=overwrite)
+    check_outputs(folder, FILES, overwrite=overwrite)
     with show_progress() as progress:
         rows = run_ablation(loaded, progress)
     files = write_ablation(folder, loaded, rows, overwrite=overwrite)
@@ -70,11 +71,12 @@ def study(
     from tuning.cli.printing import print_study
     from tuning.experiments.study.config import load_study_config
     from tuning.experiments.study.run import run_study
-    from tuning.experiments.study.write import check_study_outputs, write_study
+    from tuning.experiments.study.write import FILES, write_study
+    from tuning.experiments.tables import check_outputs
 
     folder = output or Path("runs") / config.stem
     loaded = load_study_config(config, set_ or [])
-    check_study_outputs(folder, overwrite=overwrite)
+    check_outputs(folder, FILES, overwrite=overwrite)
     try:
         with show_progress() as progress:
             found = run_study(loaded, folder, progress)

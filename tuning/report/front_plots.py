@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 from collections.abc import Sequence
 
 import matplotlib as mpl
@@ -11,14 +10,12 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 
-from tuning.report.plots import color_of, style, svg_of
+from tuning.report.plots import GRAY, color_of, png_of, style, svg_of
 from tuning.results.front import ParetoPoint, ParetoResult
 
 __all__ = ["front_png", "front_svg"]
 
-_GRAY = "#7d8590"
-_DPI = 130
-_TRIAL, _FRONT, _HOLDOUT, _PRESET = _GRAY, color_of(0), color_of(1), color_of(2)
+_TRIAL, _FRONT, _HOLDOUT, _PRESET = GRAY, color_of(0), color_of(1), color_of(2)
 _MARKS = {
     "published": ("as published", "s", color_of(3)),
     "start": ("start values", "D", color_of(4)),
@@ -38,10 +35,8 @@ def front_svg(found: ParetoResult) -> Markup:
 
 def front_png(found: ParetoResult) -> bytes:
     """Return the same plot as a PNG file on white."""
-    buffer = io.BytesIO()
     with mpl.rc_context(style()):
-        _figure(found).savefig(buffer, format="png", dpi=_DPI, facecolor="white")
-    return buffer.getvalue()
+        return png_of(_figure(found))
 
 
 def _figure(found: ParetoResult) -> Figure:

@@ -6,6 +6,7 @@ import io
 import math
 import re
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import matplotlib as mpl
@@ -15,31 +16,57 @@ from matplotlib.axis import Axis
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 
+from torchblur.io.paths import output_file
 from tuning.results.fit import FitResult, MethodResult, ParameterResult
 
-__all__ = ["color_of", "loss_curves", "parameter_paths", "style", "svg_of"]
+__all__ = [
+    "GRAY",
+    "color_of",
+    "loss_curves",
+    "parameter_paths",
+    "png_of",
+    "save_png",
+    "style",
+    "svg_of",
+]
 
-_GRAY = "#7d8590"
+GRAY = "#7d8590"
+"""Of text and axes: readable on light and on dark."""
+
 _COLORS = ("#3b82f6", "#f59e0b", "#10b981", "#ec4899", "#8b5cf6", "#14b8a6", "#ef4444", "#a3a300")
 _STYLE: Any = {
     "svg.fonttype": "none",
     "svg.hashsalt": "torchblur",
     "font.family": "sans-serif",
     "font.size": 9,
-    "text.color": _GRAY,
-    "axes.labelcolor": _GRAY,
-    "axes.edgecolor": _GRAY,
-    "xtick.color": _GRAY,
-    "ytick.color": _GRAY,
+    "text.color": GRAY,
+    "axes.labelcolor": GRAY,
+    "axes.edgecolor": GRAY,
+    "xtick.color": GRAY,
+    "ytick.color": GRAY,
     "axes.spines.top": False,
     "axes.spines.right": False,
     "axes.grid": True,
-    "grid.color": _GRAY,
+    "grid.color": GRAY,
     "grid.alpha": 0.2,
     "legend.frameon": False,
 }
+_DPI = 130
 _WIDE = 60  # ratio of the ends of an axis above which only powers of ten are labeled
 Records = Sequence[Mapping[str, Any]]
+
+
+def png_of(figure: Figure) -> bytes:
+    """Return a plot as a PNG file on white."""
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png", dpi=_DPI, facecolor="white")
+    return buffer.getvalue()
+
+
+def save_png(figure: Figure, path: Path) -> None:
+    """Save a plot as a PNG file on white; one that is there is replaced."""
+    with output_file(path, overwrite=True) as temporary:
+        temporary.write_bytes(png_of(figure))
 
 
 def style() -> Any:
@@ -69,7 +96,7 @@ def loss_curves(result: FitResult, records: Records) -> Markup:
                 _draw_starts(axes, steps)
             else:
                 _draw_trials(axes, steps)
-            axes.axhline(result.start_objective, color=_GRAY, linestyle="--", linewidth=1)
+            axes.axhline(result.start_objective, color=GRAY, linestyle="--", linewidth=1)
             axes.set(
                 title=method.name,
                 xlabel="step" if method.kind == "gradient" else "trial",
@@ -147,7 +174,7 @@ def _draw_path(axes: Axes, steps: Records, parameter: ParameterResult, _: Method
     if parameter.scale == "log":
         axes.set_yscale("log")
         _plain_numbers(axes.yaxis)
-    axes.axhline(parameter.tuned, color=_GRAY, linestyle=":", linewidth=1)
+    axes.axhline(parameter.tuned, color=GRAY, linestyle=":", linewidth=1)
 
 
 def _draw_slice(
@@ -160,7 +187,7 @@ def _draw_slice(
     if parameter.scale == "log":
         axes.set_xscale("log")
         _plain_numbers(axes.xaxis)
-    axes.axvline(method.params[parameter.name], color=_GRAY, linestyle=":", linewidth=1)
+    axes.axvline(method.params[parameter.name], color=GRAY, linestyle=":", linewidth=1)
     finite = sorted(y for y in ys if math.isfinite(y))
     if finite and finite[-1] > finite[0]:
         top = finite[int(0.9 * (len(finite) - 1))]

@@ -10,7 +10,7 @@ from markupsafe import Markup
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from tuning.report.plots import color_of, style, svg_of
+from tuning.report.plots import GRAY, color_of, style, svg_of
 from tuning.results.fit import CaseScore, FrameScore
 
 __all__ = ["frame_curves", "score_curves"]
@@ -66,7 +66,7 @@ def _draw(axes: Axes, lines: Mapping[str, Sequence[FrameScore]], key: str) -> No
     frames = next(iter(lines.values()))
     warm = sum(not frame.scored for frame in frames)
     if warm:
-        axes.axvspan(-0.5, warm - 0.5, color="#7d8590", alpha=0.15, linewidth=0)
+        axes.axvspan(-0.5, warm - 0.5, color=GRAY, alpha=0.15, linewidth=0)
     every = max(1, math.ceil(len(frames) / 12))
     axes.set_xticks(range(0, len(frames), every), [f.label for f in frames[::every]])
 

@@ -2,20 +2,15 @@
 
 from __future__ import annotations
 
-import json
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import ExitStack
-from importlib.metadata import version
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from torchblur.errors import OutputError
-from torchblur.io.paths import output_file
 from tuning.experiments.ablation.run import AblationConfig, Measured
-from tuning.files.outputs import make_folders
+from tuning.experiments.tables import check_outputs, json_text, markdown_table, write_texts
 from tuning.report.page import View, make_view, render_page
 
-__all__ = ["COLUMNS", "RULE", "cells", "check_outputs", "side_text", "tally", "write_ablation"]
+__all__ = ["COLUMNS", "FILES", "RULE", "cells", "side_text", "tally", "write_ablation"]
 
 RULE = (
     "A claim shows if FLIP and PSNR in the band at moving borders both agree: better by at least "
@@ -40,23 +35,8 @@ COLUMNS = (
 )
 """Columns with figures, between the claim and the verdict."""
 
-_FILES = ("table.md", "table.json", "ablation.html")
-
-
-def check_outputs(folder: Path, *, overwrite: bool = False) -> None:
-    """Refuse before the work what would be refused after it.
-
-    Args:
-        folder: Where the files will go.
-        overwrite: Replace files that are there.
-
-    Raises:
-        OutputError: one of them exists, or the folder cannot be made.
-    """
-    for name in _FILES:
-        if (folder / name).exists() and not overwrite:
-            raise OutputError(f"{folder / name} exists; overwrite=True (--overwrite) replaces it")
-    make_folders([folder / _FILES[0]])
+FILES = ("table.md", "table.json", "ablation.html")
+"""What is refused to be replaced."""
 
 
 def write_ablation(
@@ -73,16 +53,9 @@ def write_ablation(
     Raises:
         OutputError: a file exists, or cannot be written.
     """
-    check_outputs(folder, overwrite=overwrite)
-    makers: tuple[Callable[[AblationConfig, Sequence[Measured]], str], ...]
-    makers = (_markdown, _json, _page)
-    texts = [make(config, rows) for make in makers]
-    paths = [folder / name for name in _FILES]
-    with ExitStack() as stack:
-        for path, text in zip(paths, texts, strict=True):
-            temporary = stack.enter_context(output_file(path, overwrite=overwrite))
-            temporary.write_text(text, encoding="utf-8")
-    return paths
+    check_outputs(folder, FILES, overwrite=overwrite)
+    texts = (_markdown(config, rows), _json(config, rows), _page(config, rows))
+    return write_texts(folder, dict(zip(FILES, texts, strict=True)), overwrite=overwrite)
 
 
 def cells(measured: Measured) -> list[str]:
@@ -141,27 +114,17 @@ def _about(measured: Measured) -> str:
 
 def _markdown(config: AblationConfig, rows: Sequence[Measured]) -> str:
     head = ("", "claim", "scene, size, filter", "off → on", *COLUMNS, "verdict")
-    lines = [_line(head), _line([*["---"] * 4, *["---:"] * len(COLUMNS), "---"])]
+    lines = []
     for row in rows:
         change = f"{side_text(row.row.off)} → {side_text(row.row.on)}"
         line = [row.row.name, row.row.claim, _about(row), change, *cells(row), row.verdict]
-        lines.append(_line(line))
-    return "\n".join([f"# {config.title}", "", f"{tally(rows)}. {RULE}", "", *lines, ""])
-
-
-def _line(values: Sequence[str]) -> str:
-    return "| " + " | ".join(" ".join(v.replace("|", "\\|").split()) for v in values) + " |"
+        lines.append([" ".join(cell.split()) for cell in line])
+    table = markdown_table(head, lines, left=(*range(4), len(head) - 1))
+    return "\n".join([f"# {config.title}", "", f"{tally(rows)}. {RULE}", "", *table])
 
 
 def _json(config: AblationConfig, rows: Sequence[Measured]) -> str:
-    data = {
-        "title": config.title,
-        "torchblur": version("torchblur"),
-        "rule": RULE,
-        "rows": [_record(row) for row in rows],
-        "config": config.model_dump(mode="json"),
-    }
-    return json.dumps(data, indent=2, ensure_ascii=False) + "\n"
+    return json_text(config, indent=2, rule=RULE, rows=[_record(row) for row in rows])
 
 
 def _record(measured: Measured) -> dict[str, Any]:

@@ -10,18 +10,15 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
 
-from torchblur.io.paths import output_file
 from tuning.experiments.crossfit.config import CrossfitConfig
 from tuning.experiments.crossfit.run import Crossfit
 from tuning.experiments.crossfit.summary import Row, final_variants, mean_names
-from tuning.report.plots import color_of, style
+from tuning.report.plots import GRAY, color_of, save_png, style
 
 __all__ = ["plot_crossfit"]
 
-_DPI = 130
 _WIDTH = 0.72  # of a case's filters, where cases are 1 apart
 _TICKS = (0.1, 0.2, 0.3, 0.4, 0.5, 0.75, 1.0, 1.5, 2.0, 3.0, 5.0, 10.0)
-_GRAY = "#7d8590"
 _ALIKE = 5  # this color is too close to another one for dots
 
 
@@ -40,10 +37,10 @@ def plot_crossfit(path: Path, config: CrossfitConfig, found: Crossfit, rows: Seq
     with mpl.rc_context(style()):
         figure = Figure(figsize=(2.2 + 1.35 * len(cases), 4.6), layout="constrained")
         axes = figure.add_subplot()
-        axes.axhline(1, color=_GRAY, linewidth=1)
+        axes.axhline(1, color=GRAY, linewidth=1)
         limit = config.targets.get("flip_ratio")
         if limit is not None:
-            axes.axhline(limit, color=_GRAY, linewidth=1, linestyle=":")
+            axes.axhline(limit, color=GRAY, linewidth=1, linestyle=":")
         for index, name in enumerate(names):
             shift = _WIDTH * ((index + 0.5) / len(names) - 0.5)
             own = {
@@ -55,16 +52,15 @@ def plot_crossfit(path: Path, config: CrossfitConfig, found: Crossfit, rows: Seq
                 _rings(axes, [(cases.index(c) + shift, r) for c, r in own.items()], index)
         axes.set_xticks(range(len(cases)), [case.replace(", ", ",\n") for case in cases])
         axes.set(title=config.title, ylabel="FLIP, to that of line", yscale="log")
-        axes.axvline(len(config.data.cases) - 0.5, color=_GRAY, linewidth=0.6)
+        axes.axvline(len(config.data.cases) - 0.5, color=GRAY, linewidth=0.6)
         axes.grid(visible=False, axis="x")
         axes.yaxis.set_major_locator(FixedLocator(_TICKS))
         axes.yaxis.set_minor_locator(NullLocator())
         axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
         if any(final[name] != "default" for name in names):
-            axes.plot([], [], "o", color=_GRAY, markerfacecolor="none", label="default")
+            axes.plot([], [], "o", color=GRAY, markerfacecolor="none", label="default")
         figure.legend(*axes.get_legend_handles_labels(), loc="outside right upper", fontsize=8)
-        with output_file(path, overwrite=True) as temporary:
-            figure.savefig(temporary, format="png", dpi=_DPI, facecolor="white")
+        save_png(figure, path)
 
 
 def _draw(axes: Axes, points: Sequence[tuple[float, Row]], index: int, label: str) -> None:

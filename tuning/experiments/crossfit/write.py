@@ -2,16 +2,10 @@
 
 from __future__ import annotations
 
-import csv
 import dataclasses
-import io
-import json
 from collections.abc import Sequence
-from importlib.metadata import version
 from pathlib import Path
 
-from torchblur.io.paths import output_file
-from tuning.experiments.crossfit.bootstrap import Figure
 from tuning.experiments.crossfit.config import CrossfitConfig
 from tuning.experiments.crossfit.plot import plot_crossfit
 from tuning.experiments.crossfit.run import Crossfit, Fold
@@ -23,7 +17,7 @@ from tuning.experiments.crossfit.summary import (
     summary_of,
     verdicts,
 )
-from tuning.files.outputs import make_folders
+from tuning.experiments.tables import csv_text, json_text, markdown_table, plain, write_texts
 
 __all__ = ["COLUMNS", "TARGETS", "UNSURE", "cell", "note_of", "write_crossfit"]
 
@@ -69,13 +63,10 @@ def write_crossfit(folder: Path, config: CrossfitConfig, found: Crossfit) -> lis
         "crossfit.json": _json(config, found, rows),
         "points.csv": _csv(rows),
     }
-    make_folders([folder / name for name in texts])
-    for name, text in texts.items():
-        with output_file(folder / name, overwrite=True) as temporary:
-            temporary.write_text(text, encoding="utf-8")
+    files = write_texts(folder, texts)
     plot = folder / "ratios.png"
     plot_crossfit(plot, config, found, rows)
-    return [*(folder / name for name in texts), plot]
+    return [*files, plot]
 
 
 def cell(row: Row, name: str, *, interval: bool = True) -> str:
@@ -109,7 +100,7 @@ def _markdown(config: CrossfitConfig, found: Crossfit, rows: Sequence[Row]) -> s
         heading = case.replace(MEAN, "Mean over the cases") if case in means else case
         own = [row for row in rows if row.case == case]
         cells = [[row.label, *(cell(row, name) for name in COLUMNS)] for row in own]
-        lines += [f"## {heading}", "", *_table(head, cells)]
+        lines += [f"## {heading}", "", *markdown_table(head, cells)]
     cuts = cut_texts(config, found)
     if cuts:
         lines += ["## Cut short", "", *(f"- {text}" for text in cuts), ""]
@@ -132,7 +123,9 @@ def _targets(config: CrossfitConfig, found: Crossfit, rows: list[Row]) -> list[s
         names = dict.fromkeys(name for name, _ in texts)
         cases = [*config.data.cases, *mean_names(config, rows)]
         head = [TARGETS[target].format(limit), *cases]
-        lines += _table(head, [[n, *(texts.get((n, c), "–") for c in cases)] for n in names])
+        lines += markdown_table(
+            head, [[n, *(texts.get((n, c), "–") for c in cases)] for n in names]
+        )
     return lines
 
 
@@ -140,7 +133,7 @@ def _fits(folds: Sequence[Fold]) -> list[str]:
     """Return a table of what the fits of a filter found: a column for each left-out case."""
     head = [folds[0].filter, "start", *(f"without {fold.case}" for fold in folds)]
     rows = [
-        [name, _text(folds[0].start[name]), *(_text(fold.tuned[name]) for fold in folds)]
+        [name, plain(folds[0].start[name]), *(plain(fold.tuned[name]) for fold in folds)]
         for name in folds[0].start
     ]
     rows += [
@@ -150,45 +143,24 @@ def _fits(folds: Sequence[Fold]) -> list[str]:
         ["*evaluations*", "", *(f"{fold.passes:.0f}" for fold in folds)],
         ["*CPU s*", "", *(f"{fold.cpu_seconds:.0f}" for fold in folds)],
     ]
-    return _table(head, rows)
-
-
-def _table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
-    lines = [_line(head), _line(["---", *["---:"] * (len(head) - 1)])]
-    return [*lines, *(_line(row) for row in rows), ""]
-
-
-def _line(values: Sequence[str]) -> str:
-    return "| " + " | ".join(value.replace("|", "\\|") for value in values) + " |"
-
-
-def _text(value: object) -> str:
-    return f"{value:.4g}" if isinstance(value, float) else str(value)
+    return markdown_table(head, rows)
 
 
 def _json(config: CrossfitConfig, found: Crossfit, rows: list[Row]) -> str:
-    data = {
-        "title": config.title,
-        "torchblur": version("torchblur"),
-        "rows": [dataclasses.asdict(row) for row in rows],
-        "targets": [dataclasses.asdict(v) for v in verdicts(config, found, rows)],
-        "cut": cut_texts(config, found),
-        "folds": [dataclasses.asdict(fold) for fold in found.folds],
-        "config": config.model_dump(mode="json"),
-    }
-    return json.dumps(data, indent=1, ensure_ascii=False) + "\n"
+    return json_text(
+        config,
+        rows=[dataclasses.asdict(row) for row in rows],
+        targets=[dataclasses.asdict(v) for v in verdicts(config, found, rows)],
+        cut=cut_texts(config, found),
+        folds=[dataclasses.asdict(fold) for fold in found.folds],
+    )
 
 
 def _csv(rows: Sequence[Row]) -> str:
-    buffer = io.StringIO()
-    writer = csv.writer(buffer, lineterminator="\n")
-    writer.writerow(["case", "filter", "variant", "metric", "value", "low", "high"])
-    for row in rows:
-        for name, figure in row.figures.items():
-            writer.writerow([row.case, row.filter, row.variant, name, *_ends(figure)])
-    return buffer.getvalue()
-
-
-def _ends(figure: Figure) -> list[str]:
-    values = (figure.value, figure.low, figure.high)
-    return ["" if value is None else f"{value:.6g}" for value in values]
+    head = ("case", "filter", "variant", "metric", "value", "low", "high")
+    lines = [
+        (row.case, row.filter, row.variant, name, figure.value, figure.low, figure.high)
+        for row in rows
+        for name, figure in row.figures.items()
+    ]
+    return csv_text(head, lines)

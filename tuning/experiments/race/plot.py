@@ -9,16 +9,14 @@ import matplotlib as mpl
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from torchblur.io.paths import output_file
 from tuning.experiments.race.config import RaceConfig, RaceProblem
 from tuning.experiments.race.run import Curve, Point, grid
 from tuning.experiments.race.summary import Figure as PointFigure
 from tuning.experiments.race.summary import median_curve, target_of
-from tuning.report.plots import color_of, style
+from tuning.report.plots import GRAY, color_of, save_png, style
 
 __all__ = ["plot_race"]
 
-_DPI = 130
 _COLORS = 8  # then dashed
 _STEPS = 60  # along the seconds
 
@@ -53,13 +51,12 @@ def plot_race(
             if problem.planted is not None:
                 axes.set_yscale("log")
             elif position < 2:
-                axes.axhline(target_of(curves), color="#7d8590", linestyle=":", linewidth=1)
+                axes.axhline(target_of(curves), color=GRAY, linestyle=":", linewidth=1)
             if position == 2:
-                axes.axhline(config.tolerance, color="#7d8590", linestyle=":", linewidth=1)
+                axes.axhline(config.tolerance, color=GRAY, linestyle=":", linewidth=1)
         handles, labels = figure.axes[0].get_legend_handles_labels()
         figure.legend(handles, labels, loc="outside lower center", ncols=5, fontsize=8)
-        with output_file(path, overwrite=True) as temporary:
-            figure.savefig(temporary, format="png", dpi=_DPI, facecolor="white")
+        save_png(figure, path)
 
 
 def _draw(

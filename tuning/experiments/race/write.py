@@ -2,21 +2,16 @@
 
 from __future__ import annotations
 
-import csv
 import dataclasses
-import io
-import json
 from collections.abc import Sequence
-from importlib.metadata import version
 from pathlib import Path
 
-from torchblur.io.paths import output_file
 from tuning.experiments.kept import slug
 from tuning.experiments.race.config import RaceConfig, RaceProblem
 from tuning.experiments.race.plot import plot_race
 from tuning.experiments.race.run import Curve
 from tuning.experiments.race.summary import NEAR, Standing, standings
-from tuning.files.outputs import make_folders
+from tuning.experiments.tables import csv_text, json_text, markdown_table, plain, write_texts
 
 __all__ = ["COLUMNS", "SHORT", "cells", "note_of", "write_race"]
 
@@ -59,12 +54,7 @@ def write_race(folder: Path, config: RaceConfig, curves: Sequence[Curve]) -> lis
         "tables.md": _markdown(config, curves),
         "points.csv": _csv(curves),
     }
-    make_folders([folder / name for name in texts])
-    files = []
-    for name, text in texts.items():
-        with output_file(folder / name, overwrite=True) as temporary:
-            temporary.write_text(text, encoding="utf-8")
-        files.append(folder / name)
+    files = write_texts(folder, texts)
     for problem in config.problems:
         path = folder / f"{slug(problem.name)}.png"
         plot_race(path, config, problem, [c for c in curves if c.problem == problem.name])
@@ -104,52 +94,33 @@ def _markdown(config: RaceConfig, curves: Sequence[Curve]) -> str:
     for problem in config.problems:
         found = standings(config, problem, curves)
         lines += [f"## {problem.name}", "", note_of(config, problem), ""]
-        lines += _table(["method", *COLUMNS], [[one.entrant, *cells(config, one)] for one in found])
+        lines += markdown_table(
+            ["method", *COLUMNS], [[one.entrant, *cells(config, one)] for one in found]
+        )
         if problem.planted is not None:
             names = list(problem.planted)
-            rows = [["planted", *(_text(problem.planted[n]) for n in names), ""]]
+            rows = [["planted", *(plain(problem.planted[n]) for n in names), ""]]
             for one in found:
                 distance = "–" if one.distance is None else f"{100 * one.distance:.2f} %"
-                rows.append([one.entrant, *(_text(one.params[n]) for n in names), distance])
-            lines += _table(["method", *names, "largest distance, of the range"], rows)
+                rows.append([one.entrant, *(plain(one.params[n]) for n in names), distance])
+            lines += markdown_table(["method", *names, "largest distance, of the range"], rows)
     return "\n".join(lines)
 
 
-def _table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
-    lines = [_line(head), _line(["---", *["---:"] * (len(head) - 1)])]
-    return [*lines, *(_line(row) for row in rows), ""]
-
-
-def _line(values: Sequence[str]) -> str:
-    return "| " + " | ".join(value.replace("|", "\\|") for value in values) + " |"
-
-
-def _text(value: object) -> str:
-    return f"{value:.4g}" if isinstance(value, float) else str(value)
-
-
 def _json(config: RaceConfig, curves: Sequence[Curve]) -> str:
-    data = {
-        "title": config.title,
-        "torchblur": version("torchblur"),
-        "standings": {
-            problem.name: [dataclasses.asdict(one) for one in standings(config, problem, curves)]
-            for problem in config.problems
-        },
-        "fits": [dataclasses.asdict(curve) for curve in curves],
-        "config": config.model_dump(mode="json"),
+    ranks = {
+        problem.name: [dataclasses.asdict(one) for one in standings(config, problem, curves)]
+        for problem in config.problems
     }
-    return json.dumps(data, indent=1, ensure_ascii=False) + "\n"
+    fits = [dataclasses.asdict(curve) for curve in curves]
+    return json_text(config, standings=ranks, fits=fits)
 
 
 def _csv(curves: Sequence[Curve]) -> str:
-    buffer = io.StringIO()
-    writer = csv.writer(buffer, lineterminator="\n")
     figures = ("passes", "cpu_seconds", "train", "holdout", "distance")
-    writer.writerow(["problem", "entrant", "seed", *figures])
-    for curve in curves:
-        for point in curve.points:
-            values = [getattr(point, name) for name in figures]
-            texts = ["" if value is None else f"{value:.6g}" for value in values]
-            writer.writerow([curve.problem, curve.entrant, curve.seed, *texts])
-    return buffer.getvalue()
+    rows = [
+        (curve.problem, curve.entrant, curve.seed, *(getattr(point, name) for name in figures))
+        for curve in curves
+        for point in curve.points
+    ]
+    return csv_text(["problem", "entrant", "seed", *figures], rows)

@@ -12,13 +12,10 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator
 
-from torchblur.io.paths import output_file
 from tuning.experiments.study.run import Row
-from tuning.report.plots import color_of, style
+from tuning.report.plots import GRAY, color_of, save_png, style
 
 __all__ = ["plot_samples", "plot_time"]
-
-_DPI = 130
 
 
 def plot_time(path: Path, title: str, rows: Sequence[Row]) -> None:
@@ -45,7 +42,7 @@ def plot_time(path: Path, title: str, rows: Sequence[Row]) -> None:
             Line2D([], [], color=gray, linestyle=":", label="weighted median"),
         ]
         figure.legend(handles=handles, loc="outside right upper", fontsize=8)
-        _save(figure, path)
+        save_png(figure, path)
 
 
 def plot_samples(
@@ -65,7 +62,7 @@ def plot_samples(
         axes = figure.add_subplot()
         numbers = [n for n, _ in curve]
         axes.plot(
-            numbers, [v for _, v in curve], "o-", color="#7d8590", label="raw samples", markersize=4
+            numbers, [v for _, v in curve], "o-", color=GRAY, label="raw samples", markersize=4
         )
         for index, (name, value) in enumerate(levels.items()):
             line = "-" if index % 2 == 0 else "--"  # some levels lie upon each other
@@ -74,7 +71,7 @@ def plot_samples(
         axes.set_xticks(numbers, [str(n) for n in numbers])
         axes.set(title=title, xlabel="samples per pixel", ylabel=label)
         figure.legend(loc="outside right upper", fontsize=8)
-        _save(figure, path)
+        save_png(figure, path)
 
 
 def _draw(
@@ -86,8 +83,3 @@ def _draw(
         range(len(ys)), ys, linestyle=line, marker=marker, color=color_of(index), linewidth=1.3,
         label=label,
     )  # fmt: skip
-
-
-def _save(figure: Figure, path: Path) -> None:
-    with output_file(path, overwrite=True) as temporary:
-        figure.savefig(temporary, format="png", dpi=_DPI, facecolor="white")

@@ -2,27 +2,31 @@
 
 from __future__ import annotations
 
-import csv
-import io
-import json
 from collections.abc import Mapping, Sequence
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 from PIL import Image, ImageDraw, ImageFont
 
-from torchblur.errors import OutputError
 from torchblur.io.paths import output_file
 from tuning.experiments.kept import slug
 from tuning.experiments.study.config import StudyConfig, StudyExr, StudyScene
 from tuning.experiments.study.plot import plot_samples, plot_time
 from tuning.experiments.study.run import FACTS, Row, picture_file
 from tuning.experiments.study.scores import worth_of
+from tuning.experiments.tables import (
+    check_outputs,
+    csv_text,
+    json_text,
+    markdown_table,
+    write_texts,
+)
 
-__all__ = ["check_study_outputs", "curve_of", "worth_table", "write_study"]
+__all__ = ["FILES", "curve_of", "worth_table", "write_study"]
 
-_FILES = ("study.json", "tables.md", "tables.csv")
+FILES = ("study.json", "tables.md", "tables.csv")
+"""What is refused to be replaced."""
+
 _DIGITS = {"flip": 4, "psnr": 2, "ssim": 4, "temporal": 4, "failed": 3}
 _WORTH = {"flip": False, "psnr": True}  # whether more is better
 _LABEL_PX = 20
@@ -40,21 +44,6 @@ NOTE = (
 )
 
 
-def check_study_outputs(folder: Path, *, overwrite: bool = False) -> None:
-    """Refuse before the work what would be refused after it.
-
-    Raises:
-        OutputError: a result exists, or the folder cannot be made.
-    """
-    for name in _FILES:
-        if (folder / name).exists() and not overwrite:
-            raise OutputError(f"{folder / name} exists; overwrite=True (--overwrite) replaces it")
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise OutputError(f"cannot make the folder {folder}: {error.strerror}") from error
-
-
 def write_study(
     folder: Path, config: StudyConfig, rows: Sequence[Row], *, overwrite: bool = False
 ) -> list[Path]:
@@ -69,7 +58,7 @@ def write_study(
     Raises:
         OutputError: a file exists, or cannot be written.
     """
-    check_study_outputs(folder, overwrite=overwrite)
+    check_outputs(folder, FILES, overwrite=overwrite)
     facts = {
         row.data: {name: row.mean(name) for name in row.figures}
         for row in rows
@@ -77,16 +66,8 @@ def write_study(
     }
     rows = [row for row in rows if row.variant != FACTS]
     files = [*_plots(folder, config, rows), *_sheets(folder, config, rows)]
-    texts = {
-        "study.json": _json(config, rows, facts),
-        "tables.md": _markdown(config, rows, facts),
-        "tables.csv": _csv(rows),
-    }
-    for name, text in texts.items():
-        with output_file(folder / name, overwrite=overwrite) as temporary:
-            temporary.write_text(text, encoding="utf-8")
-        files.append(folder / name)
-    return files
+    texts = (_json(config, rows, facts), _markdown(config, rows, facts), _csv(rows))
+    return files + write_texts(folder, dict(zip(FILES, texts, strict=True)), overwrite=overwrite)
 
 
 def curve_of(
@@ -145,27 +126,16 @@ def _json(
                 "per_frame": dict(row.figures),
             }
         )
-    data = {
-        "title": config.title,
-        "torchblur": version("torchblur"),
-        "note": NOTE,
-        "facts": facts,
-        "rows": records,
-        "config": config.model_dump(mode="json"),
-    }
-    return json.dumps(data, indent=1, ensure_ascii=False) + "\n"
+    return json_text(config, note=NOTE, facts=facts, rows=records)
 
 
 def _csv(rows: Sequence[Row]) -> str:
     names = list(dict.fromkeys(name for row in rows for name in row.figures))
-    buffer = io.StringIO()
-    writer = csv.writer(buffer, lineterminator="\n")
-    writer.writerow(["data", "reference", "variant", *names, "cpu_seconds"])
-    for row in rows:
-        values = [row.mean(name) for name in names]
-        cells = ["" if v is None else f"{v:.6g}" for v in (*values, row.cpu_seconds)]
-        writer.writerow([row.data, row.reference, row.variant, *cells])
-    return buffer.getvalue()
+    lines = [
+        (row.data, row.reference, row.variant, *map(row.mean, names), row.cpu_seconds)
+        for row in rows
+    ]
+    return csv_text(["data", "reference", "variant", *names, "cpu_seconds"], lines)
 
 
 def _markdown(
@@ -186,15 +156,15 @@ def _table(rows: Sequence[Row], worth: Mapping[tuple[str, str, str], str]) -> li
     names = list(dict.fromkeys(name for row in rows for name in row.figures))
     names.sort(key=lambda name: "_" in name and name != "flip_median")  # the whole image first
     columns = ["variant", *(_heading(name) for name in names), "worth FLIP", "worth PSNR", "CPU s"]
-    lines = [_line(columns), _line(["---", *["---:"] * (len(columns) - 1)])]
+    lines = []
     for row in rows:
         key = (row.data, row.reference)
         cells = [_text(row.mean(name), _DIGITS[name.partition("_")[0]]) for name in names]
         cells += [worth.get((*key, f"{row.variant} {name}"), "") for name in _WORTH]
         cells.append(_text(row.cpu_seconds, 3) if row.cpu_seconds is not None else "")
         mark = "≈ " if row.estimated else ""
-        lines.append(_line([mark + row.variant, *cells]))
-    return [*lines, ""]
+        lines.append([mark + row.variant, *cells])
+    return markdown_table(columns, lines)
 
 
 def _heading(name: str) -> str:
@@ -210,10 +180,6 @@ def _facts_line(facts: Mapping[str, float | None]) -> str:
 
 def _text(value: float | None, digits: int) -> str:
     return "–" if value is None else f"{value:.{digits}f}"
-
-
-def _line(values: Sequence[str]) -> str:
-    return "| " + " | ".join(value.replace("|", "\\|") for value in values) + " |"
 
 
 # -- plots and pictures ----------------------------------------------------------------------------
