@@ -8,12 +8,17 @@ from typing import Annotated, Any
 
 import typer
 
-from tuning.cli.console import print_error, print_warning, results, show_progress
+from tuning.cli.console import (
+    FAILED,
+    INTERRUPTED,
+    print_error,
+    print_warning,
+    results,
+    show_progress,
+)
 from tuning.cli.options import Overwrite, Set
 
 __all__ = ["bench"]
-
-_FAILED, _INTERRUPTED = 1, 130
 
 
 def bench(  # noqa: PLR0913 - each argument is an option
@@ -119,11 +124,11 @@ def bench(  # noqa: PLR0913 - each argument is an option
     except KeyboardInterrupt as error:
         kept = "" if json_file is None else f"; what was measured is in {json_file}"
         print_error(f"stopped{kept}")
-        raise typer.Exit(_INTERRUPTED) from error
+        raise typer.Exit(INTERRUPTED) from error
     finally:
         signal.signal(signal.SIGTERM, before)
     print_report(report)
     if json_file is not None:
         results.print(f"wrote {json_file}", soft_wrap=True)
     if any(row.error for table in report.tables for row in table.rows):
-        raise typer.Exit(_FAILED)
+        raise typer.Exit(FAILED)

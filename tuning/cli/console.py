@@ -10,6 +10,7 @@ import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 
+import typer
 from rich import box
 from rich.console import Console
 from rich.markup import escape
@@ -28,6 +29,9 @@ from rich.text import Text
 from tuning.progress import Progress, ProgressEvent
 
 __all__ = [
+    "BAD_INPUT",
+    "FAILED",
+    "INTERRUPTED",
     "log",
     "metrics_table",
     "number_text",
@@ -37,7 +41,11 @@ __all__ = [
     "results",
     "show_progress",
     "status",
+    "stoppable",
 ]
+
+FAILED, BAD_INPUT, INTERRUPTED = 1, 2, 130
+"""Exit codes."""
 
 results = Console(highlight=False)
 """Standard output."""
@@ -71,6 +79,16 @@ def print_warning(message: str) -> None:
 def log(message: str) -> None:
     """Print what is going on; above the progress bar if there is one."""
     status.print(Text(message), soft_wrap=True)
+
+
+@contextmanager
+def stoppable() -> Iterator[None]:
+    """Let Ctrl-C end a command that goes on when it is started again."""
+    try:
+        yield
+    except KeyboardInterrupt as error:
+        print_error("stopped (Ctrl-C); the same command goes on")
+        raise typer.Exit(INTERRUPTED) from error
 
 
 # -- progress ----------------------------------------------------------------------------------

@@ -1,4 +1,4 @@
-"""The commands that measure claims and filters: `ablate` and `study`."""
+"""The commands that measure claims, filters and fits: `ablate`, `study`, `race`, `crossfit`."""
 
 from __future__ import annotations
 
@@ -7,12 +7,10 @@ from typing import Annotated
 
 import typer
 
-from tuning.cli.console import plain_table, print_error, results, show_progress
-from tuning.cli.options import NoCompile, Overwrite, Set
+from tuning.cli.console import plain_table, results, show_progress, stoppable
+from tuning.cli.options import NoCompile, Overwrite, RunFolder, Set
 
 __all__ = ["ablate", "crossfit", "race", "study"]
-
-_INTERRUPTED = 130
 
 
 def ablate(
@@ -22,10 +20,7 @@ def ablate(
             metavar="CONFIG", help="The claims and their scenes; configs/ablations has examples."
         ),
     ],
-    output: Annotated[
-        Path | None,
-        typer.Option("-o", "--output", metavar="DIR", help="Folder. Default: runs/CONFIG."),
-    ] = None,
+    output: RunFolder = None,
     set_: Set = None,
     overwrite: Overwrite = False,
     no_compile: NoCompile = False,
@@ -54,10 +49,7 @@ def study(
         Path,
         typer.Argument(metavar="CONFIG", help="What is measured; configs/studies has examples."),
     ],
-    output: Annotated[
-        Path | None,
-        typer.Option("-o", "--output", metavar="DIR", help="Folder. Default: runs/CONFIG."),
-    ] = None,
+    output: RunFolder = None,
     set_: Set = None,
     overwrite: Overwrite = False,
     no_compile: NoCompile = False,
@@ -77,18 +69,11 @@ def study(
     folder = output or Path("runs") / config.stem
     loaded = load_study_config(config, set_ or [])
     check_outputs(folder, FILES, overwrite=overwrite)
-    try:
-        with show_progress() as progress:
-            found = run_study(loaded, folder, progress)
-    except KeyboardInterrupt as error:
-        print_error("stopped (Ctrl-C); the same command goes on")
-        raise typer.Exit(_INTERRUPTED) from error
+    with stoppable(), show_progress() as progress:
+        found = run_study(loaded, folder, progress)
     files = write_study(folder, loaded, found, overwrite=overwrite)
     print_study(found)
     results.print(f"tables: {folder / 'tables.md'}, {len(files)} files", soft_wrap=True)
-
-
-_INTERRUPTED = 130
 
 
 def race(
@@ -96,10 +81,7 @@ def race(
         Path,
         typer.Argument(metavar="CONFIG", help="Problems and methods; configs/races has examples."),
     ],
-    output: Annotated[
-        Path | None,
-        typer.Option("-o", "--output", metavar="DIR", help="Folder. Default: runs/CONFIG."),
-    ] = None,
+    output: RunFolder = None,
     set_: Set = None,
 ) -> None:
     """Let fitting methods race: how good is each after so many evaluations and CPU-seconds.
@@ -114,12 +96,8 @@ def race(
 
     folder = output or Path("runs") / config.stem
     loaded = load_race_config(config, set_ or [])
-    try:
-        with show_progress() as progress:
-            curves = run_race(loaded, folder, progress)
-    except KeyboardInterrupt as error:
-        print_error("stopped (Ctrl-C); the same command goes on")
-        raise typer.Exit(_INTERRUPTED) from error
+    with stoppable(), show_progress() as progress:
+        curves = run_race(loaded, folder, progress)
     files = write_race(folder, loaded, curves)
     for problem in loaded.problems:
         names = tuple(SHORT.values())
@@ -132,18 +110,12 @@ def race(
     results.print(f"tables: {folder / 'tables.md'}, {len(files)} files", soft_wrap=True)
 
 
-_INTERRUPTED = 130
-
-
 def crossfit(
     config: Annotated[
         Path,
         typer.Argument(metavar="CONFIG", help="Cases and filters; configs/crossfit has examples."),
     ],
-    output: Annotated[
-        Path | None,
-        typer.Option("-o", "--output", metavar="DIR", help="Folder. Default: runs/CONFIG."),
-    ] = None,
+    output: RunFolder = None,
     set_: Set = None,
     workers: Annotated[
         int, typer.Option(min=1, metavar="N", help="Processes that share the fits; same figures.")
@@ -175,12 +147,8 @@ def crossfit(
 
     folder = output or Path("runs") / config.stem
     loaded = load_crossfit_config(config, set_ or [])
-    try:
-        with show_progress() as progress:
-            found = run_crossfit(loaded, folder, progress, workers=workers)
-    except KeyboardInterrupt as error:
-        print_error("stopped (Ctrl-C); the same command goes on")
-        raise typer.Exit(_INTERRUPTED) from error
+    with stoppable(), show_progress() as progress:
+        found = run_crossfit(loaded, folder, progress, workers=workers)
     files = write_crossfit(folder, loaded, found)
     rows = summary_of(loaded, found)
     shown = ("flip", "flip_ratio", "psnr", "flip_band", "psnr_band", "psnr_band_gain")

@@ -1,4 +1,4 @@
-"""The command that hands a tuned filter to other programs: `export`."""
+"""The commands that hand on what a fit found: `export` and `card`."""
 
 from __future__ import annotations
 

@@ -1,12 +1,25 @@
-"""Options that several commands have."""
+"""Options that several commands have, and what they stand for."""
 
 from __future__ import annotations
 
-from typing import Annotated
+from contextlib import AbstractContextManager, nullcontext
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-__all__ = ["ConventionName", "NoCompile", "Overwrite", "Scheduler", "Set"]
+if TYPE_CHECKING:
+    from tuning.parallel.cluster import Cluster
+
+__all__ = [
+    "ConventionName",
+    "NoCompile",
+    "Overwrite",
+    "RunFolder",
+    "Scheduler",
+    "Set",
+    "open_workers",
+]
 
 
 def _stop_compiling(value: bool) -> bool:
@@ -40,6 +53,9 @@ Scheduler = Annotated[
         metavar="ADDRESS", help="Give the work to a Dask cluster, such as tcp://host:8786."
     ),
 ]
+RunFolder = Annotated[
+    Path | None, typer.Option("-o", "--output", metavar="DIR", help="Folder. Default: runs/CONFIG.")
+]
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace existing results.")]
 ConventionName = Annotated[
     str,
@@ -48,3 +64,19 @@ ConventionName = Annotated[
         help="Whose channel names, units and signs: auto, torchblur, blender, nuke …",
     ),
 ]
+
+
+def open_workers(
+    scheduler: str | None, workers: int | None = None
+) -> AbstractContextManager[Cluster | None]:
+    """Return the cluster that a command's options ask for, if any.
+
+    Args:
+        scheduler: Address of a Dask scheduler.
+        workers: In its place, so many processes on this machine.
+    """
+    if scheduler is None and workers is None:
+        return nullcontext()
+    from tuning.parallel.cluster import open_cluster
+
+    return open_cluster(scheduler, workers=workers)

@@ -7,12 +7,10 @@ from typing import Annotated
 
 import typer
 
-from tuning.cli.console import print_error, results, show_progress
+from tuning.cli.console import results, show_progress, stoppable
 from tuning.cli.options import NoCompile, Overwrite
 
 __all__ = ["render"]
-
-_INTERRUPTED = 130
 
 
 def render(  # noqa: PLR0913 - each argument is an option
@@ -89,18 +87,14 @@ def render(  # noqa: PLR0913 - each argument is an option
         stream_spp=(1 if stream else 0) if stream_spp is None else stream_spp,
         point_sampled=point_sampled,
     )
-    try:
-        with show_progress() as progress:
-            files = render_file(
-                find_scene(scene),
-                output,
-                settings,
-                scenes=scenes,
-                overwrite=overwrite,
-                progress=progress,
-            )
-    except KeyboardInterrupt as error:
-        print_error("stopped (Ctrl-C); the same command goes on")
-        raise typer.Exit(_INTERRUPTED) from error
+    with stoppable(), show_progress() as progress:
+        files = render_file(
+            find_scene(scene),
+            output,
+            settings,
+            scenes=scenes,
+            overwrite=overwrite,
+            progress=progress,
+        )
     first, last = (file.relative_to(output) for file in (files[0], files[-1]))
     results.print(f"{len(files)} files in {output}: {first} to {last}")
