@@ -1,24 +1,18 @@
-"""An Optuna study over the free parameters, of every class, kept in a journal in the run folder.
+"""A search over the free parameters, of every class.
 
-The study is worked on in memory, round by round: a round is one trial, or a population that is
-drawn before any of it is known, and what is polished of it. Each finished trial is added to the
-journal with one line. The sampler of a trial is seeded by the run's seed and the trial's number. So
-a study that was killed loses the round in flight alone, draws it again with the same values, and
-ends as it would have.
+A round is one trial, or a population that is drawn before any of it is known, and what is polished
+of it.
 """
 
 from __future__ import annotations
 
 import math
-import time
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
-import optuna
-import torch
+from optuna.samplers import BaseSampler
 from optuna.trial import FrozenTrial, Trial, TrialState, create_trial
 
 from tuning.config.methods import BlackBoxMethod
@@ -27,7 +21,7 @@ from tuning.methods.gradient_state import FitError, seed_of
 from tuning.methods.job import MethodJob
 from tuning.methods.polish import Polished, PolishStart, is_promising, polish
 from tuning.methods.pruning import Climb, Ladder
-from tuning.methods.search import make_pruner, make_sampler, new_study, run_rounds, suggest
+from tuning.methods.search import Clock, Search, make_pruner, make_sampler, new_study
 from tuning.objective.candidates import evaluate_candidates
 from tuning.objective.problem import Problem
 from tuning.progress import Progress
@@ -74,39 +68,59 @@ def fit_blackbox(
         FitError: no trial has a finite loss.
     """
     search = _Search(problem, job)
-    run_rounds(search, job, job.method.trials, _record, folder, progress)
+    search.run(folder, progress)
     return search.result()
 
 
-class _Search:
+class _Search(Search):
     """The study, and what its next round depends on."""
 
     def __init__(self, problem: Problem, job: BlackBoxJob) -> None:
-        self.problem, self.job = problem, job
-        pruning = job.method.pruning
+        self.job, pruning = job, job.method.pruning
         self.ladder = (
             None
             if pruning is None
             else Ladder(problem, pruning, seed_of(job.seed, job.index, _WINDOWS_SEED))
         )
         rungs = 1 if self.ladder is None else len(self.ladder.rungs)
-        self.study = new_study(make_pruner(job.method, rungs))
+        super().__init__(
+            problem,
+            job,
+            new_study(make_pruner(job.method, rungs)),
+            trials=job.method.trials,
+            first=job.first,
+            size=job.method.population,
+            first_at_once=job.method.population > 1,
+        )
+
+    def sampler(self, seed: int) -> BaseSampler:
+        """Return the sampler of one trial."""
+        return make_sampler(self.job.method, seed)
+
+    def record(self, trial: FrozenTrial) -> dict[str, Any]:
+        """Return what is logged of a trial."""
+        is_pruned = trial.state == TrialState.PRUNED
+        known = ("passes", "cpu_seconds", _POLISHED)
+        extra = {name: trial.user_attrs[name] for name in known if name in trial.user_attrs}
+        if is_pruned:
+            extra["pruned"] = trial.value
+        return {
+            "kind": "blackbox",
+            "step": trial.number,
+            "loss": [None if is_pruned else trial.value],
+            "params": {name: [value] for name, value in trial.params.items()},
+            **extra,
+        }
 
     @property
     def drawn(self) -> int:
         """How many trials the sampler drew; what was polished of them is not counted."""
         return sum(not _is_polished(t) for t in self.study.get_trials(deepcopy=False))
 
-    @property
-    def best(self) -> float | None:
-        """The least loss so far."""
-        trials = self.study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,))
-        return min((t.value for t in trials if t.value is not None), default=None)
-
     def round(self) -> list[FrozenTrial]:
         """Draw, evaluate, polish and tell; return the finished trials in order."""
-        began = _Clock()
-        trials = [self._ask(number) for number in range(self.drawn, self._end_of_round())]
+        began = Clock()
+        trials = self.ask_round()
         drawing = began.cpu() / len(trials)
         found = self._evaluate(trials)
         polished = self._polish(trials, found)
@@ -120,23 +134,6 @@ class _Search:
                 told.append(self.study.get_trials()[-1])
         return told
 
-    def _end_of_round(self) -> int:
-        """Given points are a round of their own, so that populations are whole."""
-        size, first, drawn = self.job.method.population, len(self.job.first), self.drawn
-        end = first if size > 1 and drawn < first else drawn + size
-        return min(end, self.job.method.trials)
-
-    def _ask(self, drawn: int) -> Trial:
-        job, number = self.job, len(self.study.get_trials(deepcopy=False))
-        self.study.sampler = make_sampler(job.method, seed_of(job.seed, job.index, number))
-        if drawn < len(job.first):
-            self.study.enqueue_trial({name: job.first[drawn][name] for name in job.space.names})
-        with _one_thread(job.method.sampler == "gp"):
-            trial = self.study.ask()
-            for parameter in job.space.parameters:
-                suggest(trial, parameter)
-        return trial
-
     def _evaluate(self, trials: Sequence[Trial]) -> list[Climb]:
         candidates = [trial.params for trial in trials]
         space, fixed, together = self.job.space, self.job.fixed, self.job.method.together
@@ -148,8 +145,7 @@ class _Search:
         ]
 
     def _known_losses(self) -> list[float]:
-        trials = self.study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,))
-        return [t.value for t in trials if t.value is not None and not _is_polished(t)]
+        return [t.values[0] for t in self.complete() if not _is_polished(t)]
 
     def _polish(
         self, trials: Sequence[Trial], climbs: Sequence[Climb]
@@ -205,8 +201,7 @@ class _Search:
         """Return the best trial, evaluated as it would be written to a preset."""
         job, trials = self.job, self.study.get_trials(deepcopy=False)
         count = [trial.state for trial in trials].count
-        complete = count(TrialState.COMPLETE)
-        if not complete:
+        if not count(TrialState.COMPLETE):
             raise FitError(f"{job.name}: none of {len(trials)} trials has a finite loss")
         params = dict(job.fixed) | job.space.rounded(self.study.best_trial.params)
         return MethodResult(
@@ -221,22 +216,8 @@ class _Search:
             dropped=count(TrialState.FAIL),
             pruned=count(TrialState.PRUNED),
             polished=sum(map(_is_polished, trials)),
-            importances=_importances(self.study, complete),
+            importances=self.importances(),
         )
-
-
-class _Clock:
-    """Seconds since it was made."""
-
-    def __init__(self) -> None:
-        self._wall, self._cpu = time.monotonic(), time.process_time()
-
-    def wall(self) -> float:
-        return time.monotonic() - self._wall
-
-    def cpu(self) -> float:
-        """Of this process."""
-        return time.process_time() - self._cpu
 
 
 def _note(trial: Trial, **values: float) -> None:
@@ -257,39 +238,3 @@ def _passes(after: Polished, job: BlackBoxJob, problem: Problem) -> float:
     total, spec = len(problem.samples), job.method.polish
     batch = total if spec is None or spec.batch is None else min(spec.batch, total)
     return 1 + (after.evaluations - 1) * batch / total
-
-
-def _record(trial: FrozenTrial) -> dict[str, Any]:
-    is_pruned = trial.state == TrialState.PRUNED
-    known = ("passes", "cpu_seconds", _POLISHED)
-    extra = {name: trial.user_attrs[name] for name in known if name in trial.user_attrs}
-    if is_pruned:
-        extra["pruned"] = trial.value
-    return {
-        "kind": "blackbox",
-        "step": trial.number,
-        "loss": [None if is_pruned else trial.value],
-        "params": {name: [value] for name, value in trial.params.items()},
-        **extra,
-    }
-
-
-def _importances(study: optuna.Study, complete: int) -> dict[str, float]:
-    if complete < 10:  # fewer tell nothing
-        return {}
-    try:
-        return dict(optuna.importance.get_param_importances(study))
-    except (RuntimeError, ValueError):
-        return {}  # all trials alike: nothing to divide the spread of
-
-
-@contextmanager
-def _one_thread(wanted: bool) -> Iterator[None]:
-    """Run Optuna's Gaussian process on one thread: more of them make it slower, by far."""
-    threads = torch.get_num_threads()
-    if wanted:
-        torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(threads)

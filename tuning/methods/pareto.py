@@ -1,24 +1,19 @@
 """A search for the front: settings that no other one beats in both quality and cost.
 
-It is an Optuna study of two objectives, kept as that of a search for one is: worked on in memory,
-each finished trial a line of the journal, the sampler of a trial seeded by the run's seed and the
-trial's number. A round is a population; a killed run loses the round in flight alone, draws it
-again with the same values, and ends as it would have. The cost is counted, not measured, so it is
-the same on every machine.
+It is a search of two objectives, whose rounds are populations. The cost is counted, not measured,
+so it is the same on every machine.
 """
 
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
-import optuna
 from optuna.samplers import BaseSampler, NSGAIISampler, TPESampler
-from optuna.trial import FrozenTrial, Trial, TrialState, create_trial
+from optuna.trial import FrozenTrial, Trial, TrialState
 
 from tuning.config.cost import cost_at
 from tuning.config.methods import ParetoMethod
@@ -26,7 +21,7 @@ from tuning.files.run_folder import RunFolder
 from tuning.methods.gradient_state import FitError, seed_of
 from tuning.methods.job import MethodJob
 from tuning.methods.polish import Polished, PolishStart, polish
-from tuning.methods.search import new_study, run_rounds, suggest
+from tuning.methods.search import Clock, Search, new_study
 from tuning.objective.candidates import evaluate_candidates
 from tuning.objective.problem import Problem
 from tuning.objective.space import FreeParameter
@@ -39,7 +34,6 @@ __all__ = ["ParetoJob", "fit_pareto"]
 _OBJECTIVES = 2
 _POPULATION = 20  # of nsga2, if not said otherwise
 _POLISH_SEED = 1 << 43
-_ENOUGH = 10  # trials; the importances of fewer tell nothing
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -74,43 +68,57 @@ def fit_pareto(
         FitError: no trial has a finite loss.
     """
     search = _Search(problem, job)
-    run_rounds(search, job, job.method.trials, _record, folder, progress)
+    search.run(folder, progress)
     return search.result(_polished(search, folder, progress))
 
 
-class _Search:
+class _Search(Search):
     """The study, and what its next round depends on."""
 
     def __init__(self, problem: Problem, job: ParetoJob) -> None:
-        self.problem, self.job = problem, job
-        self.study = new_study(objectives=_OBJECTIVES)
+        self.job = job
         self.later_seconds = self.later_cpu_seconds = 0.0  # of what follows the trials
-        self.first = (*job.first, *_sweep(problem, job, job.first[-1]))
+        super().__init__(
+            problem,
+            job,
+            new_study(objectives=_OBJECTIVES),
+            trials=job.method.trials,
+            first=(*job.first, *_sweep(problem, job, job.first[-1])),
+            size=_population(job.method),
+            first_at_once=True,
+        )
 
-    @property
-    def drawn(self) -> int:
-        """How many trials there are."""
-        return len(self.study.get_trials(deepcopy=False))
+    def sampler(self, seed: int) -> BaseSampler:
+        """Return the sampler of one trial."""
+        method, seed = self.job.method, seed % (1 << 31)
+        if method.sampler == "nsga2":
+            return NSGAIISampler(population_size=_population(method), seed=seed)
+        return TPESampler(seed=seed, constant_liar=True)
 
-    @property
-    def best(self) -> float | None:
-        """The least loss so far, at whatever cost."""
-        return min((t.values[0] for t in self._complete()), default=None)
+    def record(self, trial: FrozenTrial) -> dict[str, Any]:
+        """Return what is logged of a trial."""
+        known = trial.state == TrialState.COMPLETE
+        return {
+            "kind": "pareto",
+            "step": trial.number,
+            "loss": [trial.values[0] if known else None],
+            "cost": trial.values[1] if known else None,
+            "params": {name: [value] for name, value in trial.params.items()},
+        }
 
     def round(self) -> list[FrozenTrial]:
         """Draw, evaluate and tell; return the finished trials in order."""
-        clock, cpu = time.monotonic(), time.process_time()
-        trials = [self._ask(number) for number in range(self.drawn, self._end_of_round())]
+        began, trials = Clock(), self.ask_round()
         losses = self.evaluate([self._params(trial) for trial in trials])
         for trial in trials:
-            trial.set_user_attr("seconds", (time.monotonic() - clock) / len(trials))
-            trial.set_user_attr("cpu_seconds", (time.process_time() - cpu) / len(trials))
+            trial.set_user_attr("seconds", began.wall() / len(trials))
+            trial.set_user_attr("cpu_seconds", began.cpu() / len(trials))
         return [self._tell(*pair) for pair in zip(trials, losses, strict=True)]
 
     def points(self) -> list[ParetoPoint]:
         """Return all trials with a finite loss."""
         found = []
-        for trial in self._complete():
+        for trial in self.complete():
             params = self._params(trial)
             given = trial.number < len(self.first)
             found.append(
@@ -141,9 +149,9 @@ class _Search:
             passes=evaluations,
             seconds=self.later_seconds + sum(t.user_attrs["seconds"] for t in trials),
             cpu_seconds=self.later_cpu_seconds + sum(t.user_attrs["cpu_seconds"] for t in trials),
-            dropped=len(trials) - len(self._complete()),
+            dropped=len(trials) - len(self.complete()),
             polished=polished,
-            importances=self._importances(),
+            importances=self.importances(),
             pareto=ParetoResult(
                 points=tuple(points), front=front_of(points), picks=pick(points, job.method.budgets)
             ),
@@ -154,34 +162,13 @@ class _Search:
         self.later_seconds += stored.get("seconds", 0.0)
         self.later_cpu_seconds += stored.get("cpu_seconds", 0.0)
 
-    def _complete(self) -> list[FrozenTrial]:
-        return self.study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,))
-
     def _params(self, trial: Trial | FrozenTrial) -> dict[str, Any]:
         """Return all free parameters, as they would stand in a preset."""
         return dict(self.job.fixed) | self.job.space.rounded(trial.params)
 
-    def _end_of_round(self) -> int:
-        """Given points are a round of their own, so that populations are whole."""
-        given = min(len(self.first), self.job.method.trials)
-        size = _population(self.job.method)
-        return given if self.drawn < given else min(self.drawn + size, self.job.method.trials)
-
-    def _ask(self, number: int) -> Trial:
-        self.study.sampler = _sampler(
-            self.job.method, seed_of(self.job.seed, self.job.index, number)
-        )
-        if number < len(self.first):
-            point = self.first[number]
-            self.study.enqueue_trial({name: point[name] for name in self.job.space.names})
-        trial = self.study.ask()
-        for parameter in self.job.space.parameters:
-            suggest(trial, parameter)
-        return trial
-
     def evaluate(self, candidates: Sequence[Mapping[str, Any]]) -> list[float]:
         """Return the losses; what was evaluated before is not evaluated again."""
-        known = {_key(self._params(t)): t.values[0] for t in self._complete()}
+        known = {_key(self._params(t)): t.values[0] for t in self.complete()}
         new = {_key(c): c for c in candidates if _key(c) not in known}
         found = evaluate_candidates(self.problem, self.job.space, self.job.fixed, [*new.values()])
         known |= {key: float(one.losses) for key, one in zip(new, found, strict=True)}
@@ -193,48 +180,13 @@ class _Search:
         cost = cost_at(self.problem.blur, self._params(trial)).relative
         return self.study.tell(trial, [loss, cost])
 
-    def _importances(self) -> dict[str, float]:
-        """Return the share of each parameter in the spread of the objective alone."""
-        trials = self._complete()
-        if len(trials) < _ENOUGH:
-            return {}
-        alone = new_study()
-        for trial in trials:
-            alone.add_trial(
-                create_trial(
-                    value=trial.values[0], params=trial.params, distributions=trial.distributions
-                )
-            )
-        try:
-            return dict(optuna.importance.get_param_importances(alone))
-        except (RuntimeError, ValueError):
-            return {}  # all trials alike: nothing to divide the spread of
-
 
 def _population(method: ParetoMethod) -> int:
     return method.population or (_POPULATION if method.sampler == "nsga2" else 1)
 
 
-def _sampler(method: ParetoMethod, seed: int) -> BaseSampler:
-    seed %= 1 << 31
-    if method.sampler == "nsga2":
-        return NSGAIISampler(population_size=_population(method), seed=seed)
-    return TPESampler(seed=seed, constant_liar=True)
-
-
 def _key(params: Mapping[str, Any]) -> tuple[tuple[str, Any], ...]:
     return tuple(sorted(params.items()))
-
-
-def _record(trial: FrozenTrial) -> dict[str, Any]:
-    known = trial.state == TrialState.COMPLETE
-    return {
-        "kind": "pareto",
-        "step": trial.number,
-        "loss": [trial.values[0] if known else None],
-        "cost": trial.values[1] if known else None,
-        "params": {name: [value] for name, value in trial.params.items()},
-    }
 
 
 # -- given points ----------------------------------------------------------------------------------
@@ -296,11 +248,11 @@ def _polished(
     stored = None if folder is None else folder.load_state(name)
     if stored is None:
         stage.step(0, message=f"gradient steps from {len(chosen)} presets")
-        clock = time.monotonic()
+        began = Clock()
         steps = _steps(search, chosen, smooth)
         stored = {
             "found": [_plain(after) for after in steps],
-            "seconds": time.monotonic() - clock,
+            "seconds": began.wall(),
             "cpu_seconds": sum(after.cpu_seconds for after in steps),
         }
         if folder is not None:
@@ -326,10 +278,8 @@ def _swept(
     name = f"swept-{search.job.index}.pt"
     stored = None if folder is None else folder.load_state(name)
     if stored is None:
-        clock, cpu = time.monotonic(), time.process_time()
-        losses = search.evaluate(others)
-        spent = {"seconds": time.monotonic() - clock, "cpu_seconds": time.process_time() - cpu}
-        stored = {"losses": losses} | spent
+        began, losses = Clock(), search.evaluate(others)
+        stored = {"losses": losses, "seconds": began.wall(), "cpu_seconds": began.cpu()}
         if folder is not None:
             folder.save_state(name, stored)
     search.note_time(stored)

@@ -1,4 +1,4 @@
-"""Optuna for a search: samplers, pruners, and the journal in the run folder.
+"""What searches share: Optuna's samplers and pruners, rounds, and the journal in the run folder.
 
 A round is what is drawn together: one trial, or a population, with what is polished of it. The
 journal holds whole rounds alone; what a killed process left of one is dropped and drawn again.
@@ -7,12 +7,16 @@ journal holds whole rounds alone; what a killed process left of one is dropped a
 from __future__ import annotations
 
 import math
+import time
 import warnings
-from collections.abc import Callable
+from abc import ABC, abstractmethod
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import optuna
+import torch
 from optuna.pruners import (
     BasePruner,
     HyperbandPruner,
@@ -23,18 +27,21 @@ from optuna.pruners import (
 from optuna.samplers import BaseSampler, CmaEsSampler, GPSampler, RandomSampler, TPESampler
 from optuna.storages import InMemoryStorage, JournalStorage
 from optuna.storages.journal import JournalFileBackend
-from optuna.trial import FrozenTrial, Trial, TrialState
+from optuna.trial import FrozenTrial, Trial, TrialState, create_trial
 
 from tuning.config.methods import BlackBoxMethod
 from tuning.files.run_folder import RunFolder, trim_torn_line
+from tuning.methods.gradient_state import seed_of
 from tuning.methods.job import MethodJob
+from tuning.objective.problem import Problem
 from tuning.objective.space import FreeParameter
 from tuning.progress import Progress, Stage
 
-__all__ = ["Journal", "Search", "make_pruner", "make_sampler", "new_study", "run_rounds", "suggest"]
+__all__ = ["Clock", "Journal", "Search", "make_pruner", "make_sampler", "new_study"]
 
 _NAME = "fit"  # Hyperband draws a trial's bracket from the study's name
 _END = "round_end"
+_ENOUGH = 10  # trials; the importances of fewer tell nothing
 
 
 class Journal:
@@ -128,7 +135,7 @@ def make_pruner(method: BlackBoxMethod, rungs: int) -> BasePruner:
     return HyperbandPruner(min_resource=1, max_resource=highest, reduction_factor=spec.factor)
 
 
-def suggest(trial: Trial, parameter: FreeParameter) -> Any:
+def _suggest(trial: Trial, parameter: FreeParameter) -> Any:
     """Return a trial's value of a parameter."""
     name = parameter.name
     if parameter.choices:
@@ -171,61 +178,153 @@ def _remove_lock(path: Path) -> None:
     path.with_name(f"{path.name}.lock").unlink(missing_ok=True)
 
 
-class Search(Protocol):
-    """A study in memory that goes on by rounds."""
+class Clock:
+    """Seconds since it was made."""
 
-    study: optuna.Study
+    def __init__(self) -> None:
+        self._wall, self._cpu = time.monotonic(), time.process_time()
+
+    def wall(self) -> float:
+        """Return the time that has passed."""
+        return time.monotonic() - self._wall
+
+    def cpu(self) -> float:
+        """Return that of this process."""
+        return time.process_time() - self._cpu
+
+
+class Search(ABC):
+    """An Optuna study that is worked on in memory, round by round.
+
+    Each finished trial is a line of the journal. The sampler of a trial is seeded by the run's
+    seed and the trial's number. So a study that was killed loses the round in flight alone, draws
+    it again with the same values, and ends as it would have.
+
+    Args:
+        problem: The objective.
+        job: Parameters, seed, whose journal and log lines these are.
+        study: An empty one.
+        trials: How many are drawn.
+        first: Points that are tried before any is drawn.
+        size: How many trials are a round.
+        first_at_once: Whether the first points are a round of their own, so that populations are
+            whole.
+    """
+
+    def __init__(
+        self,
+        problem: Problem,
+        job: MethodJob,
+        study: optuna.Study,
+        *,
+        trials: int,
+        first: Sequence[Mapping[str, Any]],
+        size: int,
+        first_at_once: bool,
+    ) -> None:
+        self.problem, self.study = problem, study
+        self._job, self._trials = job, trials
+        self.first, self._size, self._first_at_once = first, size, first_at_once
+
+    @abstractmethod
+    def round(self) -> list[FrozenTrial]:
+        """Draw, evaluate and tell; return the finished trials in order."""
+
+    @abstractmethod
+    def sampler(self, seed: int) -> BaseSampler:
+        """Return the sampler of one trial."""
+
+    @abstractmethod
+    def record(self, trial: FrozenTrial) -> dict[str, Any]:
+        """Return what is logged of a trial."""
 
     @property
     def drawn(self) -> int:
         """How many trials the sampler drew."""
+        return len(self.study.get_trials(deepcopy=False))
 
     @property
     def best(self) -> float | None:
         """The least loss so far."""
+        return min((t.values[0] for t in self.complete()), default=None)
 
-    def round(self) -> list[FrozenTrial]:
-        """Draw, evaluate and tell; return the finished trials in order."""
+    def complete(self) -> list[FrozenTrial]:
+        """Return the trials with a finite loss."""
+        return self.study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,))
 
+    def run(self, folder: RunFolder | None, progress: Progress | None) -> None:
+        """Go on until all trials are drawn.
 
-def run_rounds(
-    search: Search,
-    job: MethodJob,
-    trials: int,
-    record: Callable[[FrozenTrial], dict[str, Any]],
-    folder: RunFolder | None = None,
-    progress: Progress | None = None,
-) -> None:
-    """Go on with a search until it has drawn all of its trials.
+        Args:
+            folder: Where the journal and the log go; what the journal has joins the study first.
+            progress: Who is told of each round.
+        """
+        journal = None if folder is None else self._journal(folder)
+        stage = Stage(self._job.name, self._trials, progress, done=self.drawn)
+        while self.drawn < self._trials:
+            found = self.round()
+            for position, trial in enumerate(found):
+                if folder is not None and journal is not None:
+                    journal.add(trial, ends_round=position == len(found) - 1)
+                    folder.log(method=self._job.index, **self.record(trial))
+            last = [t.values[0] for t in found if t.state == TrialState.COMPLETE and t.values]
+            stage.step(self.drawn, loss=min(last, default=None), best=self.best)
 
-    Args:
-        search: An empty search; what the journal has joins it first.
-        job: Whose journal and log lines these are.
-        trials: How many are drawn.
-        record: Returns what is logged of a trial.
-        folder: Where the journal and the log go; a journal that is there is gone on from.
-        progress: Who is told of each round.
-    """
-    journal = None
-    if folder is not None:
-        journal = Journal(folder, job.index, len(search.study.directions))
+    def ask_round(self) -> list[Trial]:
+        """Draw the next round."""
+        drawn, given = self.drawn, min(len(self.first), self._trials)
+        end = min(drawn + self._size, self._trials)
+        if self._first_at_once and drawn < given:
+            end = given
+        return [self._ask(number) for number in range(drawn, end)]
+
+    def importances(self) -> dict[str, float]:
+        """Return the share of each parameter in the spread of the loss."""
+        trials = self.complete()
+        if len(trials) < _ENOUGH:
+            return {}
+        alone = new_study()
+        for trial in trials:
+            alone.add_trial(
+                create_trial(
+                    value=trial.values[0], params=trial.params, distributions=trial.distributions
+                )
+            )
+        try:
+            return dict(optuna.importance.get_param_importances(alone))
+        except (RuntimeError, ValueError):
+            return {}  # all trials alike: nothing to divide the spread of
+
+    def _ask(self, drawn: int) -> Trial:
+        job, number = self._job, len(self.study.get_trials(deepcopy=False))
+        self.study.sampler = self.sampler(seed_of(job.seed, job.index, number))
+        if drawn < len(self.first):
+            self.study.enqueue_trial({name: self.first[drawn][name] for name in job.space.names})
+        with _one_thread(isinstance(self.study.sampler, GPSampler)):
+            trial = self.study.ask()
+            for parameter in job.space.parameters:
+                _suggest(trial, parameter)
+        return trial
+
+    def _journal(self, folder: RunFolder) -> Journal:
+        journal = Journal(folder, self._job.index, len(self.study.directions))
         for trial in journal.trials():
-            search.study.add_trial(trial)
-        known = search.study.trials
-        logged = folder.drop_records(job.index, len(known))
+            self.study.add_trial(trial)
+        known = self.study.trials
+        logged = folder.drop_records(self._job.index, len(known))
         for trial in known:
             if trial.number not in logged:
-                _log(folder, job, record(trial))
-    stage = Stage(job.name, trials, progress, done=search.drawn)
-    while search.drawn < trials:
-        found = search.round()
-        for position, trial in enumerate(found):
-            if folder is not None and journal is not None:
-                journal.add(trial, ends_round=position == len(found) - 1)
-                _log(folder, job, record(trial))
-        last = [t.values[0] for t in found if t.state == TrialState.COMPLETE and t.values]
-        stage.step(search.drawn, loss=min(last, default=None), best=search.best)
+                folder.log(method=self._job.index, **self.record(trial))
+        return journal
 
 
-def _log(folder: RunFolder, job: MethodJob, record: dict[str, Any]) -> None:
-    folder.log(method=job.index, **record)
+@contextmanager
+def _one_thread(wanted: bool) -> Iterator[None]:
+    """Run Optuna's Gaussian process on one thread: more of them make it slower, by far."""
+    threads = torch.get_num_threads()
+    if wanted:
+        torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)
