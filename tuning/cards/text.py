@@ -18,7 +18,7 @@ from tuning.config.fit import TuneConfig
 from tuning.report.fit import default_label, figures_tables
 from tuning.report.front import front_section
 from tuning.report.front_files import front_method
-from tuning.report.page import Row, Table
+from tuning.report.page import FIGURES, Row, Table
 from tuning.results.fit import FitResult, ParameterResult, cut_text, worse_text
 from tuning.results.front import ParetoResult
 
@@ -35,16 +35,6 @@ _LABELS = {
 _RIVALS = ("default", "line")
 _NAMED = 2  # columns before the figures
 _Figures = dict[str, dict[str, float | None]]
-_COMPARED = {  # figure: heading, digits, whether less is better
-    "flip": ("FLIP", 4, True),
-    "psnr": ("PSNR", 2, False),
-    "ssim": ("SSIM", 4, False),
-    "flip_band": ("FLIP, borders", 4, True),
-    "psnr_band": ("PSNR, borders", 2, False),
-    "ssim_band": ("SSIM, borders", 4, False),
-    "flip_median": ("FLIP, median", 4, True),
-    "temporal": ("change in time", 4, True),
-}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -179,9 +169,7 @@ def _worse(card: Card) -> list[str]:
     scores: dict[tuple[str, str], _Figures] = {}
     for score in card.result.scores:
         scores.setdefault((score.split, score.case), {})[score.variant] = score.scores
-    keys = [
-        key for key in _COMPARED if any(key in found[card.variant] for found in scores.values())
-    ]
+    keys = [key for key in FIGURES if any(key in found[card.variant] for found in scores.values())]
     rows, counts = [], []
     for split, label in _SPLITS.items():
         cases = {case: found for (s, case), found in scores.items() if s == split}
@@ -198,7 +186,7 @@ def _worse(card: Card) -> list[str]:
     title = "## Where it is worse"
     if not rows:
         return [title, f"Nowhere: on no frame is it worse than {rivals}, by any figure shown."]
-    head = ["frame", "", *(_COMPARED[key][0] for key in keys)]
+    head = ["frame", "", *(FIGURES[key].name for key in keys)]
     kept = [i for i in range(len(head)) if i < _NAMED or any(row[i] for row in rows)]
     return [
         title,
@@ -211,8 +199,8 @@ def _worse(card: Card) -> list[str]:
 
 def _loss(found: _Figures, card: Card, key: str) -> str:
     """Return a figure and those that are better, or nothing if none is."""
-    _, digits, less = _COMPARED[key]
-    mine, sign = found[card.variant].get(key), -1 if less else 1
+    digits, sign = FIGURES[key].digits, -1 if FIGURES[key].better == "low" else 1
+    mine = found[card.variant].get(key)
     if mine is None:
         return ""
     names = {"default": card.rival, "line": _LABELS["line"]}

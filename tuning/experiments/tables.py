@@ -15,7 +15,7 @@ from torchblur.errors import OutputError
 from torchblur.io.paths import output_file
 from tuning.files.outputs import make_folders
 
-__all__ = ["check_outputs", "csv_text", "json_text", "markdown_table", "plain", "write_texts"]
+__all__ = ["check_outputs", "csv_text", "json_text", "markdown_table", "write_texts"]
 
 
 class _Titled(Protocol):
@@ -99,8 +99,3 @@ def json_text(config: _Titled, *, indent: int = 1, **found: Any) -> str:
         "config": config.model_dump(mode="json"),
     }
     return json.dumps(data, indent=indent, ensure_ascii=False) + "\n"
-
-
-def plain(value: object) -> str:
-    """Return a parameter's value for a table."""
-    return f"{value:.4g}" if isinstance(value, float) else str(value)

@@ -17,19 +17,9 @@ from torchblur.io import read_frame
 from torchblur.io.paths import output_file
 from torchblur.metrics import border_band, evaluate
 from tuning.files.images import read_color
-from tuning.report.page import Column, Row, Table, make_view, render_page
+from tuning.report.page import FIGURES, Row, Table, make_view, render_page
 
 __all__ = ["Comparison", "check_size", "compare_images", "short_names", "write_page"]
-
-_METRICS = (("flip", "FLIP", 4, "low"), ("psnr", "PSNR", 2, "high"), ("ssim", "SSIM", 4, "high"))
-_COLUMNS = {
-    f"{key}{mask}": Column(name=f"{name}{label}", digits=digits, better=better)
-    for mask, label in (("", ""), ("_band", ", borders"))
-    for key, name, digits, better in _METRICS
-} | {
-    "flip_median": Column(name="FLIP, median", digits=4, better="low"),
-    "temporal": Column(name="change in time", digits=4, better="low"),
-}
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,7 +121,7 @@ def _table(scores: Mapping[str, Mapping[str, float]]) -> Table:
         Row(name=name, values=[None if math.isnan(row[key]) else row[key] for key in keys])
         for name, row in scores.items()
     ]
-    return Table(title="Figures", columns=[_COLUMNS[key] for key in keys], rows=rows)
+    return Table(title="Figures", columns=[FIGURES[key] for key in keys], rows=rows)
 
 
 def short_names(paths: Sequence[Path]) -> list[str]:

@@ -7,20 +7,10 @@ from typing import Any
 
 from tuning.config.objective import ObjectiveSpec
 from tuning.data.cases import AnyCase
+from tuning.report.page import FIGURES
 from tuning.results.fit import FitResult, height_name
 
 __all__ = ["evidence_of"]
-
-_HEADLINE = (
-    "flip",
-    "psnr",
-    "ssim",
-    "flip_band",
-    "psnr_band",
-    "ssim_band",
-    "flip_median",
-    "temporal",
-)
 
 
 def evidence_of(
@@ -67,5 +57,5 @@ def evidence_of(
 
 
 def _figures(result: FitResult, variant: str, split: str, lines: int | None) -> dict[str, float]:
-    means = {metric: result.mean(variant, split, metric, lines) for metric in _HEADLINE}
+    means = {metric: result.mean(variant, split, metric, lines) for metric in FIGURES}
     return {metric: value for metric, value in means.items() if value is not None}

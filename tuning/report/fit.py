@@ -18,7 +18,17 @@ from tuning.data.cases import AnyCase, SequenceCase
 from tuning.data.variants import Variant, render, render_frames
 from tuning.files.run_folder import RunFolder
 from tuning.report.front import front_section, preset_names
-from tuning.report.page import Column, Row, Table, View, make_view, render_page
+from tuning.report.page import (
+    FIGURES,
+    OF_SEQUENCES,
+    Column,
+    Row,
+    Table,
+    View,
+    make_view,
+    render_page,
+    short_text,
+)
 from tuning.report.plots import loss_curves, parameter_paths
 from tuning.report.sensitivity import slope_rows
 from tuning.report.sequence_plots import score_curves
@@ -42,18 +52,6 @@ __all__ = [
 ]
 
 _MAX_VIEWS = 8
-_METRICS = {
-    "flip": Column(name="FLIP", digits=4, better="low"),
-    "psnr": Column(name="PSNR", digits=2, better="high"),
-    "ssim": Column(name="SSIM", digits=4, better="high"),
-    "flip_band": Column(name="FLIP, borders", digits=4, better="low"),
-    "psnr_band": Column(name="PSNR, borders", digits=2, better="high"),
-    "ssim_band": Column(name="SSIM, borders", digits=4, better="high"),
-}
-_OF_SEQUENCES = {
-    "flip_median": Column(name="FLIP, median", digits=4, better="low"),
-    "temporal": Column(name="change in time", digits=4, better="low"),
-}
 _NOTES = {
     "sharp": "no filter",
     "input": "the stream as it is",
@@ -192,9 +190,8 @@ def figures_table(result: FitResult, split: str, lines: int | None = None) -> Ta
         lines: One of the heights of its images; over all of them if left out.
     """
     scores = [s for s in result.scores if s.split == split and lines in (None, s.lines)]
-    columns = dict(_METRICS)
-    if any(score.frames for score in scores):
-        columns |= _OF_SEQUENCES
+    are_sequences = any(score.frames for score in scores)
+    columns = {k: c for k, c in FIGURES.items() if are_sequences or k not in OF_SEQUENCES}
     rows = [
         Row(
             name=variant,
@@ -286,10 +283,10 @@ def _parameter_row(
         "name": parameter.name,
         "symbol": parameter.symbol,
         "unit": "" if parameter.unit == "1" else parameter.unit,
-        "default": _short(parameter.default),
-        "tuned": _short(parameter.tuned),
-        "low": _short(parameter.low),
-        "high": _short(parameter.high),
+        "default": short_text(parameter.default),
+        "tuned": short_text(parameter.tuned),
+        "low": short_text(parameter.low),
+        "high": short_text(parameter.high),
         "choices": ", ".join(str(choice) for choice in parameter.choices),
         "bar": _bar(parameter),
         "at_end": parameter.tuned in (parameter.low, parameter.high) and not parameter.choices,
@@ -392,10 +389,6 @@ def _case_figure(score: CaseScore, metric: str) -> float | None:
     if metric == "cut":
         return None if score.cut is None else 100 * score.cut
     return score.scores[metric]
-
-
-def _short(value: Any) -> str:
-    return f"{value:.4g}" if isinstance(value, float) else str(value)
 
 
 def _percent(value: float, *, digits: int = 1, sign: str = "+") -> str:

@@ -9,7 +9,7 @@ from markupsafe import Markup
 
 from tuning.report.front_files import front_method
 from tuning.report.front_plots import front_svg
-from tuning.report.page import Column, Row, Table
+from tuning.report.page import Column, Row, Table, short_text
 from tuning.results.fit import FitResult
 from tuning.results.front import ParetoPoint, ParetoResult
 
@@ -94,9 +94,5 @@ def _row(found: ParetoResult, number: int) -> dict[str, Any]:
         "cost": f"{point.cost:.3f}",
         "objective": f"{point.objective:.4f}",
         "holdout": "–" if point.holdout is None else f"{point.holdout:.4f}",
-        "values": [_short(value) for value in point.params.values()],
+        "values": [short_text(value) for value in point.params.values()],
     }
-
-
-def _short(value: Any) -> str:
-    return f"{value:.4g}" if isinstance(value, float) else str(value)

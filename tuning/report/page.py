@@ -25,6 +25,8 @@ from torch import Tensor
 from torchblur.metrics import display_encode, flip_ldr
 
 __all__ = [
+    "FIGURES",
+    "OF_SEQUENCES",
     "Column",
     "Picture",
     "Row",
@@ -35,6 +37,7 @@ __all__ = [
     "make_view",
     "map_limit",
     "render_page",
+    "short_text",
 ]
 
 _MAX_EDGE = 1280
@@ -101,6 +104,24 @@ class Column:
     digits: int = 4
     better: str = ""
     signed: bool = False
+
+
+FIGURES = {
+    f"{metric}{mask}": Column(name=f"{name}{where}", digits=digits, better=better)
+    for mask, where in (("", ""), ("_band", ", borders"))
+    for metric, name, digits, better in (
+        ("flip", "FLIP", 4, "low"),
+        ("psnr", "PSNR", 2, "high"),
+        ("ssim", "SSIM", 4, "high"),
+    )
+} | {
+    "flip_median": Column(name="FLIP, median", digits=4, better="low"),
+    "temporal": Column(name="change in time", digits=4, better="low"),
+}
+"""Columns of the figures of an image; the last two are those of sequences alone."""
+
+OF_SEQUENCES = ("flip_median", "temporal")
+"""Figures that sequences alone have."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -250,6 +271,11 @@ def make_view(
     )
 
 
+def short_text(value: object) -> str:
+    """Return a parameter's value in four digits."""
+    return f"{value:.4g}" if isinstance(value, float) else str(value)
+
+
 def render_page(template: str, **context: object) -> str:
     """Return a page.
 
@@ -263,7 +289,7 @@ def render_page(template: str, **context: object) -> str:
 @functools.lru_cache(maxsize=1)
 def _environment() -> Environment:
     environment = Environment(
-        loader=PackageLoader("tuning.report.fit", "templates"),
+        loader=PackageLoader("tuning.report", "templates"),
         autoescape=True,
         undefined=StrictUndefined,
         trim_blocks=True,

@@ -17,7 +17,8 @@ from tuning.experiments.crossfit.summary import (
     summary_of,
     verdicts,
 )
-from tuning.experiments.tables import csv_text, json_text, markdown_table, plain, write_texts
+from tuning.experiments.tables import csv_text, json_text, markdown_table, write_texts
+from tuning.report.page import short_text
 
 __all__ = ["COLUMNS", "TARGETS", "UNSURE", "cell", "note_of", "write_crossfit"]
 
@@ -133,7 +134,7 @@ def _fits(folds: Sequence[Fold]) -> list[str]:
     """Return a table of what the fits of a filter found: a column for each left-out case."""
     head = [folds[0].filter, "start", *(f"without {fold.case}" for fold in folds)]
     rows = [
-        [name, plain(folds[0].start[name]), *(plain(fold.tuned[name]) for fold in folds)]
+        [name, short_text(folds[0].start[name]), *(short_text(fold.tuned[name]) for fold in folds)]
         for name in folds[0].start
     ]
     rows += [

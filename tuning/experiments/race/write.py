@@ -11,7 +11,8 @@ from tuning.experiments.race.config import RaceConfig, RaceProblem
 from tuning.experiments.race.plot import plot_race
 from tuning.experiments.race.run import Curve
 from tuning.experiments.race.summary import NEAR, Standing, standings
-from tuning.experiments.tables import csv_text, json_text, markdown_table, plain, write_texts
+from tuning.experiments.tables import csv_text, json_text, markdown_table, write_texts
+from tuning.report.page import short_text
 
 __all__ = ["COLUMNS", "SHORT", "cells", "note_of", "write_race"]
 
@@ -99,10 +100,10 @@ def _markdown(config: RaceConfig, curves: Sequence[Curve]) -> str:
         )
         if problem.planted is not None:
             names = list(problem.planted)
-            rows = [["planted", *(plain(problem.planted[n]) for n in names), ""]]
+            rows = [["planted", *(short_text(problem.planted[n]) for n in names), ""]]
             for one in found:
                 distance = "–" if one.distance is None else f"{100 * one.distance:.2f} %"
-                rows.append([one.entrant, *(plain(one.params[n]) for n in names), distance])
+                rows.append([one.entrant, *(short_text(one.params[n]) for n in names), distance])
             lines += markdown_table(["method", *names, "largest distance, of the range"], rows)
     return "\n".join(lines)
 
