@@ -8,8 +8,9 @@ from collections.abc import Mapping, Sequence
 import torch
 from torch import Tensor
 
-from torchblur.metrics import FlipReference, evaluate, prepare_flip_ldr, temporal_error
+from torchblur.metrics import FlipReference, masked_mean, prepare_flip_ldr, ssim, temporal_error
 from torchblur.metrics.pooling import weighted_median
+from torchblur.metrics.psnr import decibels
 from tuning.data.cases import SequenceCase
 from tuning.results.fit import CaseScore, FrameScore
 
@@ -80,11 +81,16 @@ class FrameByFrame:
             "temporal", the mean error of the change from the frame before in display values, NaN
             at the first frame of a shot.
         """
-        prepared = prepare_flip_ldr(reference) if prepared is None else prepared
-        found = evaluate(image, reference, masks=masks, prepared=prepared)
-        figures = {name: float(value) for name, value in found.items()}
-        figures["flip_median"] = float(weighted_median(prepared.error(image)))
-        figures["temporal"] = math.nan
+        # As `evaluate`, but for FLIP, of which the median is wanted as well.
+        error = (prepared or prepare_flip_ldr(reference)).error(image)
+        square, similarity = (image - reference) ** 2, ssim(image, reference)
+        figures = {}
+        for name, mask in {"": None, **(masks or {})}.items():
+            suffix = f"_{name}" if name else ""
+            figures[f"flip{suffix}"] = float(masked_mean(error, mask))
+            figures[f"psnr{suffix}"] = float(decibels(masked_mean(square, mask)))
+            figures[f"ssim{suffix}"] = float(masked_mean(similarity, mask))
+        figures |= {"flip_median": float(weighted_median(error)), "temporal": math.nan}
         if self._before is not None and not begins_shot:
             previous, truth = self._before
             if truth.shape == reference.shape:

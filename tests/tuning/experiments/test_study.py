@@ -13,7 +13,7 @@ from torchblur.errors import ConfigError
 from torchblur.filters import get_filter
 from torchblur.frame import Frame, Shutter
 from torchblur.io import load_yaml, write_frame, write_image
-from torchblur.metrics import flip_ldr, prepare_flip_ldr, psnr, ssim
+from torchblur.metrics import flip_ldr, psnr, ssim
 from torchblur.metrics.pooling import weighted_median
 from torchblur.metrics.temporal import temporal_error
 from torchblur.render import load_scene, render_reference, render_revealed, render_stream
@@ -22,8 +22,9 @@ from tuning.experiments.study.config import load_study_config
 from tuning.experiments.study.frames import Moment, moments
 from tuning.experiments.study.ray_mask import ray_mask_of
 from tuning.experiments.study.run import FACTS, part_file, run_study
-from tuning.experiments.study.scores import agreement, figures_of, hidden_mask, worth_of
+from tuning.experiments.study.scores import agreement, hidden_mask, worth_of
 from tuning.experiments.study.write import curve_of, worth_table, write_study
+from tuning.scoring.sequences import FrameByFrame
 
 SCENE = """
 camera: {position: [0, 0, 5]}
@@ -204,13 +205,13 @@ class TestFigures:
     def test_are_over_masks(self):
         image, reference = torch.rand(2, 1, 3, 16, 20)
         mask = torch.rand(1, 1, 16, 20) > 0.5
-        found = figures_of(image, reference, {"some": mask}, prepare_flip_ldr(reference))
+        found = FrameByFrame().figures(image, reference, masks={"some": mask})
         square = ((image - reference) ** 2).mean(1, keepdim=True)[mask].mean()
         assert found["psnr_some"] == pytest.approx(-10 * math.log10(float(square)), rel=1e-5)
         flip = flip_ldr(image, reference)
         assert found["flip_some"] == pytest.approx(float(flip[mask].mean()), rel=1e-5)
-        empty = figures_of(image, reference, {"no": mask & False}, prepare_flip_ldr(reference))
-        assert empty["ssim_no"] is None
+        empty = FrameByFrame().figures(image, reference, masks={"no": mask & False})
+        assert math.isnan(empty["ssim_no"])
 
     @pytest.mark.parametrize(
         ("value", "rising", "text"),

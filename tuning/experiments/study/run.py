@@ -34,9 +34,10 @@ from tuning.experiments.study.config import (
 )
 from tuning.experiments.study.frames import Moment, identity_of, moments
 from tuning.experiments.study.ray_mask import ray_facts, ray_mask_of, shutter_values, with_revealed
-from tuning.experiments.study.scores import figures_of, hidden_mask, moving_mask, steadiness_of
+from tuning.experiments.study.scores import hidden_mask, moving_mask
 from tuning.files.images import write_color
 from tuning.progress import Progress, Stage
+from tuning.scoring.sequences import FrameByFrame, finite_or_none
 
 FACTS = "ray mask"
 """Name of the variant that stands for figures of the data themselves."""
@@ -139,7 +140,7 @@ class _Runner:
     variant: StudyVariant
     blur: BlurFilter | None
     history: History | None = None
-    before: tuple[Tensor, Mapping[str, Tensor]] | None = None
+    judges: dict[str, FrameByFrame] = field(default_factory=dict)
     seconds: list[float] = field(default_factory=list)
     figures: dict[str, dict[str, list[float | None]]] = field(default_factory=dict)
     estimated: bool = False
@@ -180,18 +181,21 @@ class _Runner:
         moment: Moment,
         image: Tensor,
         told: Mapping[str, float | None],
-        judges: Mapping[str, FlipReference],
+        prepared: Mapping[str, FlipReference],
         masks: Mapping[str, Tensor],
     ) -> None:
         """Keep the figures of an image against all references."""
-        before = None if moment.first_of_shot else self.before
         for name, reference in moment.references.items():
-            figures = figures_of(image, reference, masks, judges[name])
-            figures["temporal"] = steadiness_of(
-                image, reference, before and (before[0], before[1][name])
+            found = self.judges.setdefault(name, FrameByFrame()).figures(
+                image,
+                reference,
+                masks=masks,
+                prepared=prepared[name],
+                begins_shot=moment.first_of_shot,
             )
-            self.keep(name, {**figures, **told})
-        self.before = (image, moment.references)
+            figures = {key: finite_or_none(value) for key, value in found.items()}
+            first = {key: figures.pop(key) for key in ("flip", "flip_median")}
+            self.keep(name, {**first, **figures, **told})
 
     def keep(self, reference: str, figures: Mapping[str, float | None]) -> None:
         lists = self.figures.setdefault(reference, {})
@@ -227,11 +231,11 @@ def _measure(
     stage.step(0)
     for moment in moments(item, raw):
         masks = _masks(config, item, moment)
-        judges = {name: prepare_flip_ldr(image) for name, image in moment.references.items()}
+        prepared = {name: prepare_flip_ldr(image) for name, image in moment.references.items()}
         shown = {f"reference {name}": image for name, image in moment.references.items()}
         for runner in runners:
             image, told = runner.image(moment, masks.get("ray_mask"))
-            runner.compare(moment, image, told, judges, masks)
+            runner.compare(moment, image, told, prepared, masks)
             shown[runner.variant.name] = image
         if asked:
             facts.keep("", ray_facts(item, moment, config.mask_params))

@@ -1,67 +1,22 @@
-"""Figures of one image, the masks that they are taken over, and what a filter is worth."""
+"""The masks that figures are taken over, and what a filter is worth in raw samples."""
 
 from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor
 
 from torchblur.frame import Shutter
-from torchblur.metrics import FlipReference, masked_mean, ssim
-from torchblur.metrics.pooling import weighted_median
-from torchblur.metrics.psnr import decibels
-from torchblur.metrics.temporal import temporal_error
 from tuning.experiments.study.frames import Moment
 
-__all__ = ["agreement", "figures_of", "hidden_mask", "moving_mask", "steadiness_of", "worth_of"]
+__all__ = ["agreement", "hidden_mask", "moving_mask", "worth_of"]
 
 _MIN_BLUR = 0.5  # px over the shutter from which a pixel counts as moving
 _HIDDEN_SHARE = 0.05  # of the shutter's time, from which background behind an object counts
 _HIDDEN_TIMES = 33
-
-
-def figures_of(
-    image: Tensor, reference: Tensor, masks: Mapping[str, Tensor], prepared: FlipReference
-) -> dict[str, float | None]:
-    """Return mean FLIP, its weighted median, PSNR and SSIM, over the image and over masks.
-
-    Args:
-        image: Scene-linear radiance, (1, 3, H, W).
-        reference: The same of the reference.
-        masks: Pixels that count, bool, (1, 1, H, W), by name.
-        prepared: The reference, prepared for FLIP.
-
-    Returns:
-        "flip", "flip_median", "psnr" (dB, linear, peak 1), "ssim" (display values), and for each
-        mask all but the median with "_<mask>"; None where a mask is empty.
-    """
-    error, square = prepared.error(image), (image - reference) ** 2
-    similarity = ssim(image, reference)
-    found = {"flip": masked_mean(error), "flip_median": weighted_median(error)}
-    for name, mask in ((None, None), *masks.items()):
-        suffix = "" if name is None else f"_{name}"
-        found[f"flip{suffix}"] = masked_mean(error, mask)
-        found[f"psnr{suffix}"] = decibels(masked_mean(square, mask))
-        found[f"ssim{suffix}"] = masked_mean(similarity, mask)
-    return {name: _finite_or_none(float(value)) for name, value in found.items()}
-
-
-def steadiness_of(
-    image: Tensor, reference: Tensor, before: tuple[Tensor, Tensor] | None
-) -> float | None:
-    """Return the mean of `temporal_error` on display values, or None where a shot begins.
-
-    Args:
-        image: Scene-linear radiance, (1, 3, H, W).
-        reference: The same of the reference.
-        before: Both of the frame before; None where a shot begins.
-    """
-    if before is None:
-        return None
-    return float(temporal_error(image, before[0], reference, before[1]).mean())
 
 
 def moving_mask(moment: Moment) -> Tensor:
@@ -164,7 +119,3 @@ def _away(moment: Moment, time: float) -> Tensor:
     depth = sharp.finite_depth()[0, 0]
     other = sharp.object_id[0, 0][y, x] != sharp.object_id[0, 0]
     return (inside & other & (depth[y, x] > depth))[None, None]
-
-
-def _finite_or_none(value: float) -> float | None:
-    return value if math.isfinite(value) else None
