@@ -17,6 +17,7 @@ from subprocess import PIPE, Popen
 from typing import IO, Any
 
 from torchblur.errors import ConfigError, OutputError
+from torchblur.io.paths import output_file
 from torchblur.params import Config
 from tuning.batch.apply import device_named
 from tuning.bench.cases import Case, Report, Row, Table
@@ -235,9 +236,5 @@ def write_report(path: Path, report: Report) -> None:
     Raises:
         OutputError: it cannot be written.
     """
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.part")
-    try:
+    with output_file(path, overwrite=True) as temporary:
         temporary.write_text(report.model_dump_json(indent=2) + "\n")
-        temporary.replace(path)
-    except OSError as error:
-        raise OutputError(f"cannot write {path}: {error.strerror}") from error

@@ -14,7 +14,7 @@ from torchblur.filters import get_filter
 from torchblur.metrics import display_encode, flip_ldr
 from tuning.cards.text import Card
 from tuning.data.cases import AnyCase, Case
-from tuning.data.variants import Variant, render, render_frames
+from tuning.data.variants import Variant, shown_image, shown_reference
 
 __all__ = ["CardPicture", "card_picture"]
 
@@ -108,25 +108,10 @@ def _row(card: Card, case: AnyCase, *, best: bool) -> dict[str, Tensor]:
     }
     if not isinstance(case, Case) and case.sharp is None:
         variants["sharp"] = Variant(name="input", stream=True)
-    images = {label: _image(variant, case) for label, variant in variants.items()}
-    images["reference"] = _reference(case)
+    images = {label: shown_image(variant, case).cpu() for label, variant in variants.items()}
+    images["reference"] = shown_reference(case).cpu()
     place = _place(images, card, best=best)
     return {label: _crop(display_encode(image)[0], place) for label, image in images.items()}
-
-
-def _image(variant: Variant, case: AnyCase) -> Tensor:
-    if isinstance(case, Case):
-        return render(variant, case).cpu()
-    return render_frames(variant, case)[_middle(case)].cpu()
-
-
-def _reference(case: AnyCase) -> Tensor:
-    return (case.reference if isinstance(case, Case) else case.references[_middle(case)]).cpu()
-
-
-def _middle(case: AnyCase) -> int:
-    assert not isinstance(case, Case)
-    return (case.warm_up + len(case)) // 2
 
 
 def _place(images: Mapping[str, Tensor], card: Card, *, best: bool) -> tuple[int, int]:

@@ -14,16 +14,16 @@ from typing import Any
 from pydantic import Field, create_model, field_validator
 
 from torchblur.errors import ConfigError, FileFormatError, nearest_name
-from torchblur.filters import get_filter, registered_filters
+from torchblur.filters import get_filter
 from torchblur.io import load_yaml
 from torchblur.ops.compiling import EngineChoice
 from torchblur.params import Config, build, choices, declared
-from torchblur.presets import load_preset
 from tuning.config.cost_limits import check_costs
 from tuning.config.data import DataSpec
 from tuning.config.methods import GradientMethod, Method, check_method, check_refresh
 from tuning.config.objective import ObjectiveSpec
 from tuning.config.overrides import apply_overrides
+from tuning.config.presets import SHUTTER_KEYS, named_filter
 
 __all__ = [
     "FilterSpec",
@@ -34,8 +34,6 @@ __all__ = [
     "resolve",
     "resolve_filter",
 ]
-
-_SHUTTER_KEYS = ("shutter", "shutter_position")
 
 
 class FreeRange(Config):
@@ -230,21 +228,13 @@ def _read_data(path: Path, where: str) -> dict[str, Any]:
 
 
 def _without_preset(spec: FilterSpec, place: str, folder: Path) -> FilterSpec:
-    if spec.kind in registered_filters():
-        return spec
-    if not spec.kind.endswith((".yaml", ".yml")):
-        try:
-            get_filter(spec.kind)
-        except ConfigError as error:
-            raise ConfigError(f"{error} ({_join(place, 'filter.kind')})") from error
-    preset = load_preset(folder / spec.kind)
-    params = {k: v for k, v in preset.params.items() if k not in _SHUTTER_KEYS}
-    return spec.model_copy(update={"kind": preset.filter, "params": params | spec.params})
+    kind, params = named_filter(spec.kind, folder, _join(place, "filter.kind"))
+    return spec.model_copy(update={"kind": kind, "params": params | spec.params})
 
 
 def _checked_params(spec: FilterSpec, place: str) -> FilterSpec:
     """Build the filter's own config where it stands in the file, so that errors name the place."""
-    for key in _SHUTTER_KEYS:
+    for key in SHUTTER_KEYS:
         if key in spec.params and key not in spec.free:
             raise ConfigError(
                 f"`{key}` belongs to the items under data, which know how their references were "

@@ -145,6 +145,11 @@ class SequenceCase:
         return self.of_lines or self.size[0]
 
     @property
+    def middle(self) -> int:
+        """Position of the frame that is shown of it: the middle one of those that are scored."""
+        return (self.warm_up + len(self)) // 2
+
+    @property
     def cuts(self) -> tuple[int, ...]:
         """Positions of frames that begin a new shot."""
         return self.samples[0].cuts

@@ -14,7 +14,7 @@ from torchblur.filters.reach import Cut, ReachingBlur
 from tuning.data.blurring import arguments, blurred, blurred_sequence
 from tuning.data.cases import AnyCase, Case, SequenceCase
 
-__all__ = ["Variant", "cut_of", "render", "render_frames"]
+__all__ = ["Variant", "cut_of", "render", "render_frames", "shown_image", "shown_reference"]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -73,6 +73,18 @@ def render_frames(variant: Variant, case: SequenceCase) -> list[Tensor]:
         case.references[0].device,
     )
     return list(blurred_sequence(blur, case.steps(blur), case.cuts, given))
+
+
+def shown_image(variant: Variant, case: AnyCase) -> Tensor:
+    """Return what is shown of a variant, (1, 3, H, W): of a sequence one frame."""
+    if isinstance(case, Case):
+        return render(variant, case)
+    return render_frames(variant, case)[case.middle]
+
+
+def shown_reference(case: AnyCase) -> Tensor:
+    """Return the reference of what is shown, (1, 3, H, W)."""
+    return case.reference if isinstance(case, Case) else case.references[case.middle]
 
 
 def cut_of(variant: Variant, case: AnyCase) -> Cut | None:

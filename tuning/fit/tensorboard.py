@@ -26,9 +26,9 @@ from torchblur.filters import get_filter
 from torchblur.metrics import display_encode, flip_ldr
 from torchblur.params import choices
 from tuning.config.fit import TuneConfig, resolve
-from tuning.data.cases import AnyCase, SequenceCase
+from tuning.data.cases import AnyCase
 from tuning.data.loading import load_cases
-from tuning.data.variants import Variant, render, render_frames
+from tuning.data.variants import Variant, shown_image, shown_reference
 from tuning.methods.run import method_name
 from tuning.objective.prepare import fit_device
 from tuning.progress import Progress, ProgressEvent
@@ -232,13 +232,7 @@ def _images(case: AnyCase, config: TuneConfig, result: FitResult) -> dict[str, T
         Variant(name="tuned", blur=blur, values=tuned, free=tuple(tuned)),
     ]
     shown = [variant for variant in variants if variant.fits(case)]
-    if isinstance(case, SequenceCase):
-        middle = (case.warm_up + len(case)) // 2
-        reference = case.references[middle]
-        images = {variant.name: render_frames(variant, case)[middle] for variant in shown}
-    else:
-        reference = case.reference
-        images = {variant.name: render(variant, case) for variant in shown}
+    images, reference = {v.name: shown_image(v, case) for v in shown}, shown_reference(case)
     errors = {
         f"error of {name}": _colored(flip_ldr(image, reference))
         for name, image in images.items()

@@ -15,7 +15,7 @@ from torchblur.filters import get_filter
 from torchblur.params import Param
 from tuning.config.fit import TuneConfig
 from tuning.data.cases import AnyCase, SequenceCase
-from tuning.data.variants import Variant, render, render_frames
+from tuning.data.variants import Variant, shown_image, shown_reference
 from tuning.files.run_folder import RunFolder
 from tuning.report.front import front_section, preset_names
 from tuning.report.page import (
@@ -237,18 +237,13 @@ def _view(index: int, case: AnyCase, variants: Sequence[Variant]) -> View:
     chosen = [v for v in variants if v.fits(case)]
     title = case.name
     if isinstance(case, SequenceCase):
-        middle = (case.warm_up + len(case)) // 2
-        title = f"{case.name}, frame {case.labels[middle]}"
-        reference = case.references[middle]
-        images = {variant.name: render_frames(variant, case)[middle] for variant in chosen}
-    else:
-        reference = case.reference
-        images = {variant.name: render(variant, case) for variant in chosen}
+        title = f"{case.name}, frame {case.labels[case.middle]}"
+    images = {variant.name: shown_image(variant, case).cpu() for variant in chosen}
     return make_view(
         str(index),
         title,
-        {name: image.cpu() for name, image in images.items()},
-        reference.cpu(),
+        images,
+        shown_reference(case).cpu(),
         subtitle=f"{_SPLITS[case.split]} · shutter {case.shutter.open:g} frame, "
         f"{case.shutter.position}",
         mapped=[name for name in ("default", "tuned", "line") if name in images],

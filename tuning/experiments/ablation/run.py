@@ -23,6 +23,7 @@ from torchblur.io import load_yaml
 from torchblur.params import Config, build
 from tuning.config.data import DataItem, DataSpec, ExrData, SceneData
 from tuning.config.overrides import apply_overrides
+from tuning.config.presets import SHUTTER_KEYS
 from tuning.data.cases import Case
 from tuning.data.loading import load_cases
 from tuning.data.variants import Variant, render
@@ -45,7 +46,6 @@ Outcome = Literal["shows", "does not show", "mixed"]
 Scores = Mapping[str, float | None]
 
 _RENDER_KEYS = ("size", "spp", "color_spp", "shutter", "shutter_position", "seed")
-_SHUTTER_KEYS = ("shutter", "shutter_position")
 _BETTER = {"flip": 0.01, "psnr": 0.05}  # least gain that counts: relative, dB
 _COMPARABLE = {"flip": 0.05, "psnr": 0.25}  # largest loss that does not count: relative, dB
 
@@ -307,7 +307,7 @@ def _check_params(row: AblationRow, where: str) -> None:
         raise ConfigError(f"{error} ({where}.filter)") from error
     for side in ("params", "off", "on"):
         values: dict[str, Any] = getattr(row, side)
-        for key in _SHUTTER_KEYS:
+        for key in SHUTTER_KEYS:
             if key in values:
                 raise ConfigError(
                     f"`{key}` belongs to the row, as the reference needs it too "

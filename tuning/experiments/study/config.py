@@ -9,12 +9,12 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, field_validator
 
 from torchblur.errors import ConfigError, nearest_name
-from torchblur.filters import BlurFilter, TemporalBlur, get_filter, registered_filters
+from torchblur.filters import BlurFilter, TemporalBlur, get_filter
 from torchblur.frame import Shutter, ShutterPosition
 from torchblur.io import load_yaml
 from torchblur.params import Config, build
-from torchblur.presets import load_preset
 from tuning.config.overrides import apply_overrides
+from tuning.config.presets import SHUTTER_KEYS, named_filter
 from tuning.render.scene import find_scene
 
 __all__ = [
@@ -39,8 +39,6 @@ Mask = Literal["band", "moving", "ray_mask", "hidden"]
 band: at moving borders. moving: where something moves in the sharp frame or in a sample. ray_mask:
 where Tan 2022 asks for rays. hidden: where the reference shows background behind a moving object.
 """
-
-_SHUTTER_KEYS = ("shutter", "shutter_position")
 
 
 class _Item(Config):
@@ -236,17 +234,10 @@ def _with_path(item: StudyScene | StudyExr, folder: Path, place: str) -> StudySc
 
 
 def _with_preset(variant: StudyVariant, folder: Path, place: str) -> StudyVariant:
-    name = variant.filter
-    if name is None or name in registered_filters():
+    if variant.filter is None:
         return variant
-    if not name.endswith((".yaml", ".yml")):
-        try:
-            get_filter(name)
-        except ConfigError as error:
-            raise ConfigError(f"{error} ({place}.filter)") from error
-    preset = load_preset(folder / name)
-    own = {key: value for key, value in preset.params.items() if key not in _SHUTTER_KEYS}
-    return variant.model_copy(update={"filter": preset.filter, "params": own | variant.params})
+    name, params = named_filter(variant.filter, folder, f"{place}.filter")
+    return variant.model_copy(update={"filter": name, "params": params | variant.params})
 
 
 def _check_names(config: StudyConfig, place: str) -> None:
@@ -306,7 +297,7 @@ def _check_revealed(config: StudyConfig, item: StudyScene | StudyExr, where: str
 def _check_filter(variant: StudyVariant, where: str) -> None:
     assert variant.filter is not None
     kind = get_filter(variant.filter)
-    for key in _SHUTTER_KEYS:
+    for key in SHUTTER_KEYS:
         if key in variant.params:
             raise ConfigError(f"`{key}` belongs to the data ({where}.params.{key})")
     build(kind.config_class, variant.params, f"{where}.params")
