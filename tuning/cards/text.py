@@ -18,7 +18,7 @@ from tuning.config.fit import TuneConfig
 from tuning.report.fit import default_label, figures_tables
 from tuning.report.front import front_section
 from tuning.report.front_files import front_method
-from tuning.report.page import FIGURES, Row, Table
+from tuning.report.page import FIGURES, Row, Table, render_page
 from tuning.results.fit import FitResult, ParameterResult, cut_text, worse_text
 from tuning.results.front import ParetoResult
 
@@ -76,31 +76,43 @@ def card_text(card: Card, used: str, picture: str, caption: str, plot: str | Non
         caption: What the picture shows.
         plot: Name of the plot of the front, beside it.
     """
-    parts = [
-        f"# {card.name}",
-        _head(card, used),
-        f"![sharp, line blur, {card.rival}, {card.name}, reference]({picture})",
-        caption,
-        *_figures(card),
-        *_worse(card),
-        *_level(card, plot),
-        *_parameters(card),
-        *_made(card),
-    ]
-    return "\n\n".join(parts) + "\n"
-
-
-def _head(card: Card, used: str) -> str:
-    kind = get_filter(card.preset.filter)
-    summary = " ".join((kind.__doc__ or "").split()).split(". ")[0].rstrip(".")
-    worse, cut = (text(card.result, card.variant) for text in (worse_text, cut_text))
-    return (
-        (f"**{worse}**\n\n" if worse else "")
-        + f"{summary}: `{card.preset.filter}` with constants that were fitted to references"
-        f"{_heights(card.result)}.{f' Mind its reach: {cut}' if cut else ''}\n\n"
-        f"```\n{card.result.command}\ntorchblur filter {used} INPUT.exr -o OUTPUT.exr\n```\n\n"
-        f"The first command makes it (search and gradient: {_time(card.result)}), the second uses "
-        "it."
+    kind, result = get_filter(card.preset.filter), card.result
+    splits = {"train": card.config.data.train, "holdout": card.config.data.holdout}
+    return render_page(
+        "card.md",
+        card=card,
+        used=used,
+        picture=picture,
+        caption=caption,
+        plot=plot,
+        worse=worse_text(result, card.variant),
+        cut=cut_text(result, card.variant),
+        summary=" ".join((kind.__doc__ or "").split()).split(". ")[0].rstrip("."),
+        heights=_heights(result),
+        time=_time(result),
+        figures=[_figures(table, card) for table in figures_tables(result)],
+        losses=_losses(card),
+        level=_level(card),
+        origin="published" if kind.published else "default",
+        parameters=_parameters(card),
+        lengths=_lengths(card),
+        data=[
+            [_SPLITS[split].lower(), item.kind, f"`{item.path}`", *_about(item)]
+            for split, items in splits.items()
+            for item in items
+        ],
+        objective=_objective(card),
+        methods=[
+            [
+                method.name,
+                method.evaluations,
+                f"{method.objective:.5f}",
+                f"{method.cpu_seconds:.0f}",
+                "chosen" if method.name == result.chosen else "",
+            ]
+            for method in result.methods
+        ],
+        versions=", ".join(f"{name} {version}" for name, version in result.versions.items()),
     )
 
 
@@ -121,51 +133,32 @@ def _time(result: FitResult) -> str:
 # -- before and after ------------------------------------------------------------------------------
 
 
-def _figures(card: Card) -> list[str]:
-    parts = ["## Before and after"]
-    for table in figures_tables(card.result):
-        rows = [_named(row, card) for row in table.rows if _is_shown(row.name, card)]
-        shown = Table(title="", columns=table.columns, rows=rows)
-        parts += [f"{table.title}; means. The best of a column is bold.", _markdown(shown)]
-    parts.append(
-        "FLIP and SSIM are of display values, PSNR is in dB on linear color; “borders” is the band "
-        "that moving borders sweep. “A perfect image” is what the reference's own noise leaves."
-        if "noise" in card.result.variants()
-        else "FLIP and SSIM are of display values, PSNR is in dB on linear color; “borders” is the "
-        "band that moving borders sweep."
-    )
-    return parts
-
-
-def _is_shown(name: str, card: Card) -> bool:
-    return name in (*_LABELS, "default", card.variant)
-
-
-def _named(row: Row, card: Card) -> Row:
+def _figures(table: Table, card: Card) -> tuple[str, list[str], list[list[str]]]:
+    """Return title, headings and cells of a table of means."""
     names = _LABELS | {"default": card.rival, card.variant: card.label}
-    name = names[row.name]
-    return Row(name=name, values=row.values, ranked=row.ranked)
+    rows = [
+        Row(name=names[row.name], values=row.values, ranked=row.ranked)
+        for row in table.rows
+        if row.name in names
+    ]
+    return table.title, *_cells(Table(title="", columns=table.columns, rows=rows))
 
 
-def _markdown(table: Table) -> str:
+def _cells(table: Table) -> tuple[list[str], list[list[str]]]:
     rows = []
     for row in table.rows:
         cells = [table.text(row, index) for index in range(len(table.columns))]
         best = [table.is_best(row, index) for index in range(len(table.columns))]
         pairs = zip(cells, best, strict=True)
         rows.append([row.name, *(f"**{cell}**" if bold else cell for cell, bold in pairs)])
-    return _rows(["", *(column.name for column in table.columns)], rows)
-
-
-def _rows(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    lines = [head, ["---"] * len(head), *rows]
-    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
+    return ["", *(column.name for column in table.columns)], rows
 
 
 # -- where it is worse -----------------------------------------------------------------------------
 
 
-def _worse(card: Card) -> list[str]:
+def _losses(card: Card) -> dict[str, Any]:
+    """Return the frames on which the preset is worse than what it is compared with."""
     scores: dict[tuple[str, str], _Figures] = {}
     for score in card.result.scores:
         scores.setdefault((score.split, score.case), {})[score.variant] = score.scores
@@ -183,18 +176,14 @@ def _worse(card: Card) -> list[str]:
         for name in _RIVALS
         if name in card.result.variants()
     )
-    title = "## Where it is worse"
-    if not rows:
-        return [title, f"Nowhere: on no frame is it worse than {rivals}, by any figure shown."]
     head = ["frame", "", *(FIGURES[key].name for key in keys)]
     kept = [i for i in range(len(head)) if i < _NAMED or any(row[i] for row in rows)]
-    return [
-        title,
-        f"On {' and '.join(counts)} it is worse than {rivals} by at least one figure, as far as "
-        "the digits show. Each cell has its figure and the better one of the other; where nothing "
-        "stands it is not worse.",
-        _rows([head[i] for i in kept], [[row[i] for i in kept] for row in rows]),
-    ]
+    return {
+        "counts": " and ".join(counts),
+        "rivals": rivals,
+        "head": [head[i] for i in kept],
+        "rows": [[row[i] for i in kept] for row in rows],
+    }
 
 
 def _loss(found: _Figures, card: Card, key: str) -> str:
@@ -217,24 +206,24 @@ def _loss(found: _Figures, card: Card, key: str) -> str:
 # -- the level, the parameters, how it was made ----------------------------------------------------
 
 
-def _level(card: Card, plot: str | None) -> list[str]:
+def _level(card: Card) -> dict[str, Any] | None:
+    """Return how the preset stands among the others of its front, if it is one of several."""
     section, method = front_section(card.result), front_method(card.result)
     if card.variant == "tuned" or section is None or method is None or method.pareto is None:
-        return []
-    pick = next(pick for pick in method.pareto.picks if pick.name == card.variant)
+        return None
     rows = [
         Row(name=f"**{row.name}**" if row.name == card.variant else row.name, values=row.values)
         for row in section.presets.rows
     ]
-    shown = [] if plot is None else [f"![Quality against cost, and the presets]({plot})"]
-    return [
-        "## Among the levels",
-        f"The best of {section.tried} settings that cost at most {pick.budget:g} of Guertin 2014 "
-        "with 35 taps. Cost is counted from the configuration: lookups, arithmetic and passes. "
-        + _beside_published(method.pareto, card.rival),
-        _markdown(Table(title="", columns=section.presets.columns, rows=rows)),
-        *shown,
-    ]
+    head, cells = _cells(Table(title="", columns=section.presets.columns, rows=rows))
+    budget = next(pick.budget for pick in method.pareto.picks if pick.name == card.variant)
+    return {
+        "tried": section.tried,
+        "budget": f"{budget:g}",
+        "beside_published": _beside_published(method.pareto, card.rival),
+        "head": head,
+        "rows": cells,
+    }
 
 
 def _beside_published(found: ParetoResult, label: str) -> str:
@@ -251,7 +240,7 @@ def _beside_published(found: ParetoResult, label: str) -> str:
     )
 
 
-def _parameters(card: Card) -> list[str]:
+def _parameters(card: Card) -> list[list[str]]:
     of = get_filter(card.preset.filter)
     specs, default = declared(of.config_class), of.config_class()
     free = {parameter.name: parameter for parameter in card.result.parameters}
@@ -262,9 +251,7 @@ def _parameters(card: Card) -> list[str]:
         unit = "" if spec.unit == "1" else spec.unit
         cells = (f"`{name}`", _value(published), _value(value), unit, _range(free.get(name)))
         rows.append([*cells, spec.meaning])
-    origin = "published" if of.published else "default"
-    head = ["", origin, "here", "unit", "range of the fit", "meaning"]
-    return ["## Parameters", _rows(head, rows), *_lengths(card, list(free))]
+    return rows
 
 
 def _value(value: Any) -> str:
@@ -281,49 +268,18 @@ def _range(parameter: ParameterResult | None) -> str:
     return f"{_value(parameter.low)} to {_value(parameter.high)}"
 
 
-def _lengths(card: Card, free: Sequence[str]) -> list[str]:
+def _lengths(card: Card) -> str:
+    """Return which parameters are lengths in px, and of which sizes of images."""
     specs = declared(get_filter(card.preset.filter).config_class)
-    names = [f"`{name}`" for name in free if specs[name].unit == "px"]
-    sizes = {size for size in map(_size, _items(card.config)) if size}
-    if not names or not sizes:
-        return []
-    return [f"{', '.join(names)}: in px, fitted to images of {' and '.join(sorted(sizes))}."]
-
-
-def _items(config: TuneConfig) -> tuple[DataItem, ...]:
-    return (*config.data.train, *config.data.holdout)
+    names = [f"`{p.name}`" for p in card.result.parameters if specs[p.name].unit == "px"]
+    sizes = set(map(_size, (*card.config.data.train, *card.config.data.holdout)))
+    if not names or not sizes - {""}:
+        return ""
+    return f"{', '.join(names)}: in px, fitted to images of {' and '.join(sorted(sizes - {''}))}."
 
 
 def _size(item: DataItem) -> str:
     return str(getattr(item, "size", ""))
-
-
-def _made(card: Card) -> list[str]:
-    result, config = card.result, card.config
-    data = [
-        [_SPLITS[split].lower(), item.kind, f"`{item.path}`", *_about(item)]
-        for split, items in (("train", config.data.train), ("holdout", config.data.holdout))
-        for item in items
-    ]
-    methods = [
-        [
-            method.name,
-            str(method.evaluations),
-            f"{method.objective:.5f}",
-            f"{method.cpu_seconds:.0f}",
-            "chosen" if method.name == result.chosen else "",
-        ]
-        for method in result.methods
-    ]
-    versions = ", ".join(f"{name} {version}" for name, version in result.versions.items())
-    return [
-        "## How it was made",
-        _rows(["", "data", "path", "which", "size", "samples", "shutter", "weight"], data),
-        _objective(card),
-        _rows(["method", "evaluations", "objective", "CPU-seconds", ""], methods),
-        f"Seed {result.seed}. {versions}.",
-        *(f"- {note}" for note in result.notes),
-    ]
 
 
 def _about(item: DataItem) -> list[str]:

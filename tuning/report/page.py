@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 import torch.nn.functional as F
-from jinja2 import Environment, PackageLoader, StrictUndefined
+from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescape
 from markupsafe import Markup
 from matplotlib import colormaps
 from PIL import Image
@@ -277,11 +277,11 @@ def short_text(value: object) -> str:
 
 
 def render_page(template: str, **context: object) -> str:
-    """Return a page.
+    """Return a page, or a card in Markdown.
 
     Args:
-        template: File in `tuning/report/templates`; it extends `base.html`.
-        **context: What the template names. Text is escaped; only `Markup` is not.
+        template: File in `tuning/report/templates`; pages extend `base.html`.
+        **context: What the template names. In HTML text is escaped; only `Markup` is not.
     """
     return _environment().get_template(template).render(**context)
 
@@ -290,7 +290,7 @@ def render_page(template: str, **context: object) -> str:
 def _environment() -> Environment:
     environment = Environment(
         loader=PackageLoader("tuning.report", "templates"),
-        autoescape=True,
+        autoescape=select_autoescape(["html"]),
         undefined=StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
