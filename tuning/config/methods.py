@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import Field
 
@@ -23,6 +23,7 @@ __all__ = [
     "check_method",
     "check_refresh",
     "polished_names",
+    "smooth_by_default",
 ]
 
 
@@ -226,6 +227,24 @@ def polished_names(
     if method.polish.free is not None:
         return tuple(name for name in names if name in method.polish.free)
     return tuple(name for name in names if specs[name].grad == "smooth")
+
+
+def smooth_by_default(
+    methods: Sequence[AnyMethod], free: Collection[str], specs: Mapping[str, Param]
+) -> list[dict[str, Any]]:
+    """Return methods as plain data, in which a gradient without `free` takes what is smooth.
+
+    Args:
+        methods: The methods.
+        free: Names of the free parameters.
+        specs: Declarations of the filter's parameters.
+    """
+    smooth = tuple(name for name in free if specs[name].grad == "smooth") or None
+    found = [method.model_dump() for method in methods]
+    for method in found:
+        if method["kind"] == "gradient" and method["free"] is None:
+            method["free"] = smooth
+    return found
 
 
 def check_method(

@@ -80,23 +80,29 @@ def settings_of(size: str, **values: Any) -> RenderSettings:
     return build(RenderSettings, {"width": width, "height": height, **values})
 
 
-def find_scene(scene: str) -> Path:
+def find_scene(scene: str, folder: Path | None = None, place: str = "") -> Path:
     """Return the file of a scene, or of a family of scenes.
 
     Args:
         scene: A path, or a name in `configs/scenes` or `configs/families`.
+        folder: What the path is relative to; the working folder if left out, or as well.
+        place: Key path with the file, for the message.
 
     Raises:
         ConfigError: there is none; names the nearest.
     """
-    if Path(scene).is_file():
-        return Path(scene)
+    for path in (Path(scene) if folder is None else folder / scene, Path(scene)):
+        if path.is_file():
+            return path
     places = [root / "configs" / kind for root in _ROOTS for kind in ("families", "scenes")]
     known = {path.stem: path for place in places for path in sorted(place.glob("*.yaml"))}
     if scene not in known:
         hint = nearest_name(scene, known)
         names = f"; scenes: {', '.join(sorted(known))}" if known else ""
-        raise ConfigError(f"no scene `{scene}`{hint}{names}; or give the path of a YAML file")
+        where = f" ({place})" if place else ""
+        raise ConfigError(
+            f"no scene `{scene}`{hint}{names}; or give the path of a YAML file{where}"
+        )
     return known[scene]
 
 

@@ -277,16 +277,9 @@ def _resolved(row: AblationRow, folder: Path, place: str) -> AblationRow:
         return row.model_copy(update={"exr": row.exr.model_copy(update={"path": path})})
     if row.scene is None:
         return row
-    return row.model_copy(update={"scene": str(_scene_path(row.scene, folder, place))})
-
-
-def _scene_path(scene: str, folder: Path, place: str) -> Path:
-    if (folder / scene).is_file():
-        return (folder / scene).resolve()
-    try:
-        return find_scene(scene).resolve()
-    except ConfigError as error:
-        raise ConfigError(f"{error} ({place}.scene)") from error
+    return row.model_copy(
+        update={"scene": str(find_scene(row.scene, folder, f"{place}.scene").resolve())}
+    )
 
 
 def _check_rows(config: AblationConfig, place: str = "") -> None:
@@ -330,6 +323,6 @@ def _item(config: AblationConfig, row: AblationRow, where: str) -> DataItem:
         return row.exr
     assert row.scene is not None
     shared = {key: getattr(config, key) for key in _RENDER_KEYS}
-    path = str(_scene_path(row.scene, Path.cwd(), where))
+    path = str(find_scene(row.scene, place=f"{where}.scene").resolve())
     data = {"kind": "scene", "path": path, "frames": [row.frame]} | shared | own
     return build(SceneData, data, where)

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 from pydantic import Field
 
@@ -25,7 +25,7 @@ from tuning.config.data import (
     SceneStreamData,
 )
 from tuning.config.fit import FilterSpec, FreeRange, TuneConfig, resolve, resolve_filter
-from tuning.config.methods import Method
+from tuning.config.methods import Method, smooth_by_default
 from tuning.config.objective import ObjectiveSpec
 from tuning.config.overrides import apply_overrides
 from tuning.render.scene import find_scene
@@ -139,7 +139,11 @@ class CrossfitConfig(Config):
                 "crops": None if crops is None else crops.model_dump(),
             },
             "objective": self.objective.model_dump(),
-            "methods": _methods(self, entry),
+            "methods": smooth_by_default(
+                entry.methods or self.methods or (),
+                entry.filter.free,
+                declared(get_filter(entry.filter.kind).config_class),
+            ),
             "seed": self.seed,
             "device": self.device,
             "engine": self.engine,
@@ -193,9 +197,7 @@ def _found(item: DataItem, root: Path) -> DataItem:
     """Return an item whose scene or family is a file."""
     if not isinstance(item, (SceneData, FamilyData, SceneStreamData, FamilyStreamData)):
         return item
-    path = root / item.path
-    found = path if path.is_file() else find_scene(item.path)
-    return item.model_copy(update={"path": str(found.resolve())})
+    return item.model_copy(update={"path": str(find_scene(item.path, root).resolve())})
 
 
 def _resolved(config: CrossfitConfig, name: str, place: str, folder: Path) -> CrossfitEntry:
@@ -216,14 +218,3 @@ def _resolved(config: CrossfitConfig, name: str, place: str, folder: Path) -> Cr
         )
     spec = resolve_filter(entry.filter, f"{place}: filters.{name}", folder)
     return entry.model_copy(update={"filter": spec})
-
-
-def _methods(config: CrossfitConfig, entry: CrossfitEntry) -> list[dict[str, Any]]:
-    """Return the methods of a fit; a gradient without `free` takes what is smooth."""
-    specs = declared(get_filter(entry.filter.kind).config_class)
-    smooth = tuple(name for name in entry.filter.free if specs[name].grad == "smooth") or None
-    methods = [method.model_dump() for method in entry.methods or config.methods or ()]
-    for method in methods:
-        if method["kind"] == "gradient" and method["free"] is None:
-            method["free"] = smooth
-    return methods

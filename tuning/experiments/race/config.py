@@ -14,7 +14,7 @@ from torchblur.io import load_yaml
 from torchblur.params import Config, build, declared
 from tuning.config.data import DataSpec
 from tuning.config.fit import FilterSpec, TuneConfig, resolve
-from tuning.config.methods import GradientMethod, Method
+from tuning.config.methods import GradientMethod, Method, smooth_by_default
 from tuning.config.objective import ObjectiveSpec
 from tuning.config.overrides import apply_overrides
 
@@ -73,11 +73,8 @@ class RaceConfig(Config):
             entrant: Who fits it.
             seed: Of this fit; windows are the same for all.
         """
-        smooth = _smooth_names(problem)
-        methods = [method.model_dump() for method in entrant.methods]
-        for method in methods:
-            if method["kind"] == "gradient" and method["free"] is None:
-                method["free"] = smooth
+        specs = declared(get_filter(problem.filter.kind).config_class)
+        methods = smooth_by_default(entrant.methods, problem.filter.free, specs)
         return _tune_config(self, problem, methods, seed)
 
 
@@ -129,11 +126,6 @@ def _tune_config(
         "device": config.device,
     }
     return build(TuneConfig, data | engine, problem.name)
-
-
-def _smooth_names(problem: RaceProblem) -> tuple[str, ...] | None:
-    specs = declared(get_filter(problem.filter.kind).config_class)
-    return tuple(n for n in problem.filter.free if specs[n].grad == "smooth") or None
 
 
 def _check_names(config: RaceConfig, place: str) -> None:

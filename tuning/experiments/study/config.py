@@ -223,13 +223,8 @@ def _with_path(item: StudyScene | StudyExr, folder: Path, place: str) -> StudySc
         found = (folder / item.path).resolve()
         if not found.is_dir():
             raise ConfigError(f"the folder {found} does not exist ({place})")
-    elif (folder / item.path).is_file():
-        found = (folder / item.path).resolve()
     else:
-        try:
-            found = find_scene(item.path).resolve()
-        except ConfigError as error:
-            raise ConfigError(f"{error} ({place})") from error
+        found = find_scene(item.path, folder, place).resolve()
     return item.model_copy(update={"path": str(found)})
 
 
