@@ -8,7 +8,7 @@ from pathlib import Path
 
 from torch import Tensor
 
-from torchblur.errors import ConfigError, FrameError, OutputError
+from torchblur.errors import ConfigError, FrameError
 from torchblur.filters import BlurFilter
 from torchblur.filters.base import TemporalBlur
 from torchblur.frame import Frame
@@ -26,7 +26,14 @@ from tuning.batch.apply import (
 from tuning.config.overrides import apply_overrides
 from tuning.files.frame_numbers import shots_of
 from tuning.files.images import read_color
-from tuning.files.outputs import Job, find_inputs, make_folders, name_outputs, numbered
+from tuning.files.outputs import (
+    Job,
+    find_inputs,
+    make_folders,
+    name_outputs,
+    numbered,
+    refuse_existing,
+)
 from tuning.objective.engine import files_engine
 from tuning.progress import Progress, Stage
 from tuning.scoring.baselines import Scores, SequenceJudge, asked_name, judge, mean_scores
@@ -95,10 +102,8 @@ def plan_files(
     pairs: list[tuple[Path, Path | None]] = [(source, None) for source in sources]
     if output is not None:
         named = name_outputs(sources, output)
-        existing = [path for _, path in named if path.exists()]
-        if existing and not overwrite:
-            raise OutputError(f"{existing[0]} exists; overwrite=True (--overwrite) replaces it")
-        make_folders([path for _, path in named])
+        refuse_existing((path for _, path in named), overwrite=overwrite)
+        make_folders(path for _, path in named)
         pairs = list(named)
     beside = {"gbuffer": gbuffer, "reference": reference}
     return [

@@ -26,6 +26,7 @@ from tuning.bench.machine import busy_warning, describe_machine, watch
 from tuning.bench.plan import BenchOptions, TablePlan, plan_tables, unique_cases
 from tuning.bench.ratios import fits_of, with_ratios
 from tuning.bench.targets import judge_targets, targets_for
+from tuning.files.outputs import refuse_existing
 from tuning.parallel.cores import count_cores
 from tuning.progress import Progress, Stage
 
@@ -224,8 +225,7 @@ def check_output(path: Path, *, overwrite: bool) -> None:
     Raises:
         OutputError: it exists and `overwrite` is off, or its folder is not there.
     """
-    if path.exists() and not overwrite:
-        raise OutputError(f"{path} exists; overwrite=True (--overwrite) replaces it")
+    refuse_existing([path], overwrite=overwrite)
     if path.is_dir() or not path.absolute().parent.is_dir():
         raise OutputError(f"cannot write {path}: its folder does not exist, or it is a folder")
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from PIL import Image
 
-from torchblur.errors import ConfigError, OutputError
+from torchblur.errors import ConfigError
 from torchblur.io.paths import output_file
 from torchblur.presets import load_preset, save_preset
 from tuning.cards.picture import card_picture
@@ -15,6 +15,7 @@ from tuning.cards.text import Card, card_text
 from tuning.config.fit import load_tune_config
 from tuning.data.cases import AnyCase
 from tuning.data.loading import load_cases
+from tuning.files.outputs import make_folders, refuse_existing
 from tuning.progress import Progress, Stage
 from tuning.report.front import preset_names
 from tuning.results.fit import FitResult
@@ -55,11 +56,11 @@ def write_cards(
     if not (run / "result.json").is_file():
         raise ConfigError(f"{run} has no result.json: a folder of a finished fit is needed")
     cards = _cards(run)
-    folders = [cards_dir, *([] if presets_dir is None else [Path(presets_dir)])]
-    for folder in folders:
-        _make_folder(folder)
-    if not overwrite:
-        _refuse_existing(cards, cards_dir, presets_dir)
+    places = [(cards_dir, ".md"), (cards_dir, ".webp")]
+    places += [] if presets_dir is None else [(Path(presets_dir), ".yaml")]
+    files = [folder / f"{card.name}{end}" for card in cards for folder, end in places]
+    make_folders(files)
+    refuse_existing(files, overwrite=overwrite)
     cases = load_cases(cards[0].config.data)
     plot = _write_plot(run, cards[0], cards_dir)
     stage = Stage("cards", len(cards), progress)
@@ -83,22 +84,6 @@ def _cards(run: Path) -> list[Card]:
         )
         for variant, path in (names or {"tuned": run / "preset.yaml"}).items()
     ]
-
-
-def _make_folder(folder: Path) -> None:
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise OutputError(f"cannot make the folder {folder}: {error.strerror}") from error
-
-
-def _refuse_existing(cards: list[Card], folder: Path, presets: str | Path | None) -> None:
-    for card in cards:
-        files = [folder / f"{card.name}.md", folder / f"{card.name}.webp"]
-        files += [] if presets is None else [Path(presets) / f"{card.name}.yaml"]
-        for file in files:
-            if file.exists():
-                raise OutputError(f"{file} exists; overwrite=True (--overwrite) replaces it")
 
 
 def _write(

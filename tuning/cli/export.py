@@ -110,14 +110,13 @@ def _write_program(
 ) -> None:
     import torch
 
-    from torchblur.errors import OutputError
     from torchblur.export import constants_text, export_program, save_program
     from torchblur.filters import get_filter
     from torchblur.frame import Frame
+    from tuning.files.outputs import refuse_existing
     from tuning.render.scene import settings_of
 
-    if output.exists() and not overwrite:  # before the minute that the graph takes
-        raise OutputError(f"{output} exists; overwrite=True (--overwrite) replaces it")
+    refuse_existing([output], overwrite=overwrite)  # before the minute that the graph takes
     settings = settings_of(size)
     height, width = settings.height, settings.width
     frame = Frame(

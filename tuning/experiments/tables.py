@@ -11,9 +11,8 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Protocol
 
-from torchblur.errors import OutputError
 from torchblur.io.paths import output_file
-from tuning.files.outputs import make_folders
+from tuning.files.outputs import make_folders, refuse_existing
 
 __all__ = ["check_outputs", "csv_text", "json_text", "markdown_table", "write_texts"]
 
@@ -36,10 +35,9 @@ def check_outputs(folder: Path, names: Sequence[str], *, overwrite: bool = False
     Raises:
         OutputError: one of them exists, or the folder cannot be made.
     """
-    for name in names:
-        if (folder / name).exists() and not overwrite:
-            raise OutputError(f"{folder / name} exists; overwrite=True (--overwrite) replaces it")
-    make_folders([folder / names[0]])
+    paths = [folder / name for name in names]
+    refuse_existing(paths, overwrite=overwrite)
+    make_folders(paths)
 
 
 def write_texts(folder: Path, texts: Mapping[str, str], *, overwrite: bool = True) -> list[Path]:

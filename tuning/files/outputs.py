@@ -25,6 +25,7 @@ __all__ = [
     "newest_of",
     "number_of",
     "numbered",
+    "refuse_existing",
     "remove_leftovers",
     "state_of",
 ]
@@ -273,6 +274,17 @@ def _begins_as_image(path: Path) -> bool:
     with path.open("rb") as file:
         head = file.read(8)
     return any(head[: len(magic)] == magic[: len(head)] for magic in _MAGIC)
+
+
+def refuse_existing(outputs: Iterable[Path], *, overwrite: bool = False) -> None:
+    """Refuse to replace a file, before the work that leads to it.
+
+    Raises:
+        OutputError: one of them exists, and `overwrite` is off.
+    """
+    for output in outputs:
+        if output.exists() and not overwrite:
+            raise OutputError(f"{output} exists; overwrite=True (--overwrite) replaces it")
 
 
 def make_folders(outputs: Iterable[Path]) -> None:

@@ -18,13 +18,13 @@ from torchblur.filters import BlurFilter, get_filter
 from torchblur.presets import Preset, save_preset
 from tuning.config.fit import TuneConfig, resolve
 from tuning.config.methods import GradientMethod
-from tuning.data.cases import AnyCase, SequenceCase
+from tuning.data.cases import SequenceCase
 from tuning.data.variants import Variant
 from tuning.files.run_folder import RunFolder, open_run
 from tuning.fit.ceiling import ceiling
 from tuning.fit.front_scores import budget_notes, judged
 from tuning.methods.run import run_methods
-from tuning.objective.prepare import fit_device, prepare
+from tuning.objective.prepare import Prepared, fit_device, prepare
 from tuning.objective.problem import Problem
 from tuning.objective.sensitivity import measure_sensitivity
 from tuning.objective.space import Space
@@ -48,17 +48,12 @@ __all__ = ["run_fit"]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class _Setting:
+class _Setting(Prepared):
     """What all stages of a run share."""
 
     config: TuneConfig
     folder: RunFolder
     progress: Progress | None
-    space: Space
-    blur: BlurFilter
-    cases: list[AnyCase]
-    problem: Problem
-    notes: tuple[str, ...]
 
 
 def run_fit(
@@ -150,16 +145,7 @@ def _prepare(config: TuneConfig, folder: RunFolder, progress: Progress | None) -
         folder.log(note=note)
         if progress is not None:
             progress(ProgressEvent(stage="data", done=total, total=total, message=note))
-    return _Setting(
-        config=config,
-        folder=folder,
-        progress=progress,
-        space=ready.space,
-        blur=ready.blur,
-        cases=ready.cases,
-        problem=ready.problem,
-        notes=ready.notes,
-    )
+    return _Setting(**vars(ready), config=config, folder=folder, progress=progress)
 
 
 def _evaluate(
