@@ -13,19 +13,12 @@ import time
 from typing import Any
 
 from tuning.files.run_folder import RunFolder
-from tuning.methods.gradient_state import (
-    AdamState,
-    FitError,
-    GradientJob,
-    State,
-    finite_or_none,
-    scalars,
-)
+from tuning.methods.gradient_state import AdamState, FitError, GradientJob, State, scalars
 from tuning.methods.lbfgs import LbfgsState
 from tuning.methods.scene_pool import Pool
 from tuning.objective.problem import Problem
 from tuning.progress import Progress, Stage
-from tuning.results.fit import MethodResult, StartResult
+from tuning.results.fit import MethodResult, StartResult, finite_or_none
 
 __all__ = ["fit_gradient"]
 

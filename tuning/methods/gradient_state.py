@@ -18,13 +18,13 @@ from tuning.config.methods import GradientMethod
 from tuning.methods.job import MethodJob
 from tuning.objective.problem import Problem
 from tuning.objective.space import Space
+from tuning.results.fit import finite_or_none
 
 __all__ = [
     "AdamState",
     "FitError",
     "GradientJob",
     "State",
-    "finite_or_none",
     "losses_and_slopes",
     "scalars",
     "seed_of",
@@ -243,11 +243,6 @@ def _starts(job: GradientJob) -> Tensor:
 def scalars(space: Space, point: Tensor) -> dict[str, float]:
     """Return the values at one point of the unit cube."""
     return {name: float(value) for name, value in space.from_unit(point[None]).items()}
-
-
-def finite_or_none(value: float) -> float | None:
-    """Return a number as JSON can have it."""
-    return value if math.isfinite(value) else None
 
 
 def _or_zero(leaf: Tensor) -> Tensor:

@@ -18,8 +18,8 @@ from tuning.files.frame_numbers import frame_numbers, numbered_file
 from tuning.files.images import read_color
 from tuning.report.compare import Comparison, check_size, short_names
 from tuning.report.sequence_plots import frame_curves
-from tuning.results.fit import FrameScore
-from tuning.scoring.sequences import FrameByFrame, finite_or_none
+from tuning.results.fit import FrameScore, finite_or_none
+from tuning.scoring.sequences import FrameByFrame
 
 __all__ = ["compare_sequences", "is_sequence"]
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from pathlib import Path
 from typing import Any, Literal
 
@@ -22,6 +23,7 @@ __all__ = [
     "SensitivityResult",
     "StartResult",
     "cut_text",
+    "finite_or_none",
     "height_name",
     "worse_text",
 ]
@@ -237,6 +239,11 @@ class FitResult(Config):
         except (OSError, ValueError) as error:
             raise ConfigError(f"{path} is no result of a fit: {error}") from error
         return build(cls, data, str(path))
+
+
+def finite_or_none(value: float) -> float | None:
+    """Return a number as JSON can have it: None if it is infinite or NaN."""
+    return value if math.isfinite(value) else None
 
 
 def cut_text(result: FitResult, variant: str) -> str:

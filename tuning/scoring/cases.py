@@ -11,8 +11,8 @@ from torchblur.metrics import evaluate
 from tuning.data.cases import AnyCase, Case, SequenceCase
 from tuning.data.variants import Variant, cut_of, render, render_frames
 from tuning.progress import Stage
-from tuning.results.fit import CaseScore
-from tuning.scoring.sequences import finite_or_none, noisy_frames, score_frames
+from tuning.results.fit import CaseScore, finite_or_none
+from tuning.scoring.sequences import noisy_frames, score_frames
 
 __all__ = ["noise_scores", "score_cases", "score_image", "score_variant"]
 

@@ -12,16 +12,9 @@ from torchblur.metrics import FlipReference, masked_mean, prepare_flip_ldr, ssim
 from torchblur.metrics.pooling import weighted_median
 from torchblur.metrics.psnr import decibels
 from tuning.data.cases import SequenceCase
-from tuning.results.fit import CaseScore, FrameScore
+from tuning.results.fit import CaseScore, FrameScore, finite_or_none
 
-__all__ = [
-    "FrameByFrame",
-    "finite_or_none",
-    "mean_of_frames",
-    "noisy_frames",
-    "score_frames",
-    "sequence_figures",
-]
+__all__ = ["FrameByFrame", "mean_of_frames", "noisy_frames", "score_frames", "sequence_figures"]
 
 
 def score_frames(case: SequenceCase, variant: str, images: Sequence[Tensor]) -> CaseScore:
@@ -142,8 +135,3 @@ def noisy_frames(case: SequenceCase) -> list[Tensor]:
         + torch.randn(reference.shape, generator=generator).to(reference) * variance.sqrt()
         for reference, variance in zip(case.references, case.variances, strict=True)
     ]
-
-
-def finite_or_none(value: float) -> float | None:
-    """Return a figure, or None if it is infinite or NaN."""
-    return value if math.isfinite(value) else None

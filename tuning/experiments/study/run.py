@@ -37,7 +37,8 @@ from tuning.experiments.study.ray_mask import ray_facts, ray_mask_of, shutter_va
 from tuning.experiments.study.scores import hidden_mask, moving_mask
 from tuning.files.images import write_color
 from tuning.progress import Progress, Stage
-from tuning.scoring.sequences import FrameByFrame, finite_or_none
+from tuning.results.fit import finite_or_none
+from tuning.scoring.sequences import FrameByFrame
 
 FACTS = "ray mask"
 """Name of the variant that stands for figures of the data themselves."""
