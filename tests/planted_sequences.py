@@ -7,8 +7,9 @@ from typing import Annotated, Any, ClassVar
 import torch
 import torch.nn.functional as F
 
-from torchblur.filters.base import _REGISTRY, FilterConfig, History, TemporalBlur
-from torchblur.frame import Frame, Sequence, Shutter
+from torchblur.filters.base import FilterConfig, History, TemporalBlur
+from torchblur.filters.registry import _REGISTRY
+from torchblur.frame import Frame, FrameSequence, Shutter
 from torchblur.io import write_frame, write_image
 from torchblur.metrics import border_band
 from torchblur.params import Param
@@ -48,7 +49,7 @@ _REGISTRY.pop(Recall.name)  # other tests go through all filters; fixture `recal
 
 def moving_sequence(
     count: int, seed: int = 0, size: tuple[int, int] = (48, 64), cuts: tuple[int, ...] = ()
-) -> Sequence:
+) -> FrameSequence:
     """Return frames of noise under a disk that moves by 3 px a frame."""
     generator = torch.Generator().manual_seed(seed)
     height, width = size
@@ -70,7 +71,7 @@ def moving_sequence(
                 source=f"tiny {index}",
             )
         )
-    return Sequence(tuple(frames), cuts)
+    return FrameSequence(tuple(frames), cuts)
 
 
 def sequence_case(

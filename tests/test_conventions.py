@@ -3,13 +3,13 @@
 import pytest
 import torch
 
-from torchblur.filters import get_filter, registered_filters
+from torchblur.filters import get_filter, list_filters
 from torchblur.frame import Frame, Shutter
 from torchblur.ops.gather import lookup
 from torchblur.ops.velocity import half_velocity
 
 # Filters of streams take no sharp frame: each pixel's time says where it is.
-OF_SHARP_FRAMES = [name for name, kind in registered_filters().items() if "time" not in kind.needs]
+OF_SHARP_FRAMES = [name for name, kind in list_filters().items() if "time" not in kind.needs]
 
 pytestmark = pytest.mark.filterwarnings("ignore:tan2022. no layer:UserWarning")
 

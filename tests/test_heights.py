@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from torchblur.filters import TemporalBlur, get_filter, registered_filters
+from torchblur.filters import TemporalBlur, get_filter, list_filters
 from torchblur.frame import Shutter
 from torchblur.metrics import evaluate
 from torchblur.presets import create_filter
@@ -16,7 +16,7 @@ pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("ignore:tan2022. no l
 CONFIGS = Path(__file__).parents[1] / "configs"
 SHUTTER = 0.3  # half spreads of 17 px at 270 lines, 69 px at 1080
 HEIGHTS = (270, 540, 1080)
-FORMS = [name for name in registered_filters() if not issubclass(get_filter(name), TemporalBlur)]
+FORMS = [name for name in list_filters() if not issubclass(get_filter(name), TemporalBlur)]
 PRESETS = sorted(
     path
     for path in (CONFIGS / "filters").glob("*-*.yaml")

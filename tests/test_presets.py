@@ -6,7 +6,7 @@ import torch
 
 import torchblur
 from torchblur.errors import ConfigError, OutputError, TorchblurError
-from torchblur.filters import registered_filters
+from torchblur.filters import get_filter, list_filters
 from torchblur.presets import Preset, create_filter, load_preset, save_preset
 from torchblur.testing.frames import moving_square
 
@@ -14,7 +14,7 @@ from torchblur.testing.frames import moving_square
 def test_every_filter_has_a_config_and_every_config_loads(repository):
     folder = repository / "configs" / "filters"
     loaded = {path.stem: load_preset(path).filter for path in folder.rglob("*.yaml")}
-    assert set(registered_filters()) <= set(loaded)
+    assert set(list_filters()) <= set(loaded)
     for stem, name in loaded.items():
         assert stem.startswith(name)
         create_filter(folder / f"{stem}.yaml")
@@ -104,3 +104,24 @@ def test_our_own_filter_is_the_default():
 def test_public_names_exist():
     for name in torchblur.__all__:
         assert getattr(torchblur, name) is not None
+
+
+def test_a_module_is_saved_as_it_is_now(tmp_path):
+    path = tmp_path / "p.yaml"
+    blur = create_filter("guertin2014", kappa=30.0, num_samples=9)
+    with torch.no_grad():
+        blur.kappa.fill_(31.3)
+    save_preset(path, blur, comment="mine")
+    assert load_preset(path).params == {"num_samples": 9, "kappa": 31.3}
+    assert create_filter(path).current_config() == blur.current_config()
+    with torch.no_grad():
+        blur.kappa.fill_(0.5)
+    with pytest.raises(ConfigError, match=r"`kappa` must lie in"):
+        save_preset(path, blur, overwrite=True)
+
+
+def test_a_filter_that_no_name_leads_to_is_not_saved(tmp_path):
+    kind = type("Own", (get_filter("line"),), {})
+    kind.name = "nobody"  # too late to be registered
+    with pytest.raises(ConfigError, match="unknown filter `nobody`"):
+        save_preset(tmp_path / "p.yaml", kind())

@@ -13,7 +13,7 @@ from PIL import Image, ImageDraw, ImageFont
 from torch import Tensor
 
 from torchblur.filters import TemporalBlur, get_filter
-from torchblur.frame import Sequence, Shutter
+from torchblur.frame import FrameSequence, Shutter
 from torchblur.metrics import display_encode
 from torchblur.presets import create_filter
 from torchblur.render import (
@@ -115,7 +115,7 @@ def one_sample_per_pixel(
     """
     scene, shutter = _scene("crossing_spheres_long"), Shutter(1.0)
     renderer = Renderer(scene, images=frames)
-    stream = Sequence(tuple(renderer.stream(size, frame=i)[0] for i in range(frames)))
+    stream = FrameSequence(tuple(renderer.stream(size, frame=i)[0] for i in range(frames)))
     last = frames - 1
     presets: dict[str, str | Path] = {
         "Oberberger 2022, as published": "oberberger2022",

@@ -17,7 +17,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchblur.filters import TemporalBlur, get_filter, registered_filters
+from torchblur.filters import TemporalBlur, get_filter, list_filters
 from torchblur.frame import Frame, Shutter
 from torchblur.metrics import evaluate
 from torchblur.params import declared
@@ -80,7 +80,7 @@ def main() -> None:
     """Measure all filters and write the table."""
     path = Path(sys.argv[1]) if len(sys.argv) > 1 else _CONFIGS.parent / "docs" / "sizes.md"
     windows = {lines: list(_windows(lines)) for lines in _HEIGHTS}
-    names = [n for n in registered_filters() if not issubclass(get_filter(n), TemporalBlur)]
+    names = [n for n in list_filters() if not issubclass(get_filter(n), TemporalBlur)]
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # what Tan 2022 goes without, and ReachWarning
         found = [row for name in names for row in rows(name, windows)]

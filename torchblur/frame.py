@@ -32,7 +32,7 @@ from torch import Tensor
 from torchblur.errors import FrameError
 from torchblur.layers import CHANNELS, check_agreement, shaped, without_bad_values
 
-__all__ = ["FAR_DEPTH", "LONGEST_SHUTTER", "Frame", "Sequence", "Shutter", "ShutterPosition"]
+__all__ = ["FAR_DEPTH", "LONGEST_SHUTTER", "Frame", "FrameSequence", "Shutter", "ShutterPosition"]
 
 ShutterPosition = Literal["centered", "leading", "trailing"]
 
@@ -350,7 +350,7 @@ class Frame:
 
 
 @dataclass(frozen=True, eq=False)
-class Sequence:
+class FrameSequence:
     """Consecutive frames of one size, and where a new shot begins.
 
     Args:
@@ -392,6 +392,6 @@ class Sequence:
     def __getitem__(self, index: int) -> Frame:
         return self.frames[index]
 
-    def map(self, function: Callable[[Frame], Frame]) -> Sequence:
+    def map(self, function: Callable[[Frame], Frame]) -> FrameSequence:
         """Return the sequence with a function applied to each frame (a crop, a move)."""
-        return Sequence(tuple(function(frame) for frame in self.frames), self.cuts)
+        return FrameSequence(tuple(function(frame) for frame in self.frames), self.cuts)

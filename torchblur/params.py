@@ -15,6 +15,9 @@ table that `torchblur params` prints. Nothing about a parameter is written anywh
 from __future__ import annotations
 
 import math
+import operator
+import re
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Literal, TypeVar, get_args
 
@@ -31,9 +34,12 @@ from torch import Tensor
 
 from torchblur.errors import ConfigError, nearest_name
 
-__all__ = ["Config", "GradClass", "Param", "build", "choices", "declared"]
+__all__ = ["Config", "GradClass", "Param", "build", "choices", "declared", "idle"]
 
 GradClass = Literal["smooth", "weak", "discrete"]
+
+_CLAUSE = re.compile(r"(\w+) (==|!=|>) ([\w.]+)")
+_COMPARE = {"==": operator.eq, "!=": operator.ne, ">": operator.gt}
 ModelT = TypeVar("ModelT", bound=BaseModel)
 
 
@@ -52,6 +58,8 @@ class Param:
         low: Least valid value, included. Needed for numbers.
         high: Greatest valid value, included. Needed for numbers.
         scale: "log" if fits should work on its logarithm (then `low` must be positive).
+        active_when: What others must be for it to act: "reach == frame", "tap_spacing > 0",
+            "sampling == pairs and noise != none"; left out: always.
     """
 
     meaning: str
@@ -62,8 +70,12 @@ class Param:
     low: float | None = None
     high: float | None = None
     scale: Literal["linear", "log"] = "linear"
+    active_when: str = ""
 
     def __post_init__(self) -> None:
+        clauses = self.active_when.split(" and ") if self.active_when else []
+        if not all(_CLAUSE.fullmatch(clause) for clause in clauses):
+            raise TypeError(f"Param: no condition: {self.active_when!r}")
         if (self.low is None) != (self.high is None):
             raise TypeError("Param: give both `low` and `high`, or neither")
         if self.low is not None and self.high is not None and not self.low < self.high:
@@ -81,6 +93,20 @@ class Param:
         if self.low is None or self.high is None:
             raise TypeError("this parameter is a choice and has no range")
         return self.low, self.high
+
+    @property
+    def conditions(self) -> tuple[tuple[str, str, Any], ...]:
+        """What `active_when` says: name, comparison and value of each part."""
+        found = _CLAUSE.findall(self.active_when)
+        return tuple((name, compare, _literal(text)) for name, compare, text in found)
+
+    def acts(self, values: Mapping[str, Any]) -> bool:
+        """Return whether the parameter can change anything.
+
+        Args:
+            values: Of all parameters that `active_when` names.
+        """
+        return all(_COMPARE[how](values[name], value) for name, how, value in self.conditions)
 
     @property
     def range_text(self) -> str:
@@ -151,7 +177,8 @@ class Param:
         self, schema: CoreSchema, handler: GetJsonSchemaHandler
     ) -> dict[str, Any]:
         result = handler(schema)
-        result["description"] = f"{self.meaning} [{self.unit}] ({self.source})"
+        when = f"; acts when {self.active_when}" if self.active_when else ""
+        result["description"] = f"{self.meaning} [{self.unit}] ({self.source}){when}"
         if self.low is not None:
             result |= {"minimum": self.low, "maximum": self.high}
         return result
@@ -175,6 +202,37 @@ def declared(model: type[BaseModel]) -> dict[str, Param]:
             if isinstance(item, Param):
                 specs[name] = item
     return specs
+
+
+def idle(model: type[BaseModel], values: Mapping[str, Any]) -> dict[str, str]:
+    """Return the parameters that change nothing with these values, and what they wait for.
+
+    What waits for a parameter that itself cannot act waits, too.
+
+    Args:
+        model: A configuration class.
+        values: Of its parameters; the defaults of those that are left out.
+    """
+    specs = declared(model)
+    given = {name: values.get(name, field.default) for name, field in model.model_fields.items()}
+
+    def waits(name: str) -> str:
+        spec = specs[name]
+        if not spec.acts(given):
+            return spec.active_when
+        return next(filter(None, (waits(other) for other, *_ in spec.conditions)), "")
+
+    return {name: reason for name in specs if (reason := waits(name))}
+
+
+def _literal(text: str) -> Any:
+    """Return what a word of a condition stands for: a switch, a number or a choice."""
+    if text in ("true", "false"):
+        return text == "true"
+    try:
+        return float(text)
+    except ValueError:
+        return text
 
 
 def choices(model: type[BaseModel], name: str) -> tuple[Any, ...]:

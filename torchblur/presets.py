@@ -15,7 +15,8 @@ from typing import Any
 from pydantic import Field
 
 from torchblur.errors import ConfigError
-from torchblur.filters import BlurFilter, get_filter, registered_filters
+from torchblur.filters import BlurFilter, get_filter, list_filters
+from torchblur.filters.base import with_shutter
 from torchblur.io.yaml import load_yaml, save_yaml
 from torchblur.ops.compiling import EngineChoice
 from torchblur.ops.gather import Storage
@@ -58,19 +59,29 @@ def load_preset(path: str | Path) -> Preset:
 
 
 def save_preset(
-    path: str | Path, preset: Preset, *, comment: str | None = None, overwrite: bool = False
+    path: str | Path,
+    preset: Preset | BlurFilter,
+    *,
+    comment: str | None = None,
+    overwrite: bool = False,
 ) -> None:
     """Write a preset so that `load_preset` and `create_filter` take it.
 
     Args:
         path: Where to.
-        preset: What to write.
+        preset: What to write; of a filter, the values that it has now and that differ from its
+            defaults.
         comment: Lines for the head of the file.
         overwrite: Replace an existing file.
 
     Raises:
         OutputError: the file exists and `overwrite` is off, or it cannot be written.
+        ConfigError: a value of the filter has left its range, or the filter is not registered.
     """
+    if isinstance(preset, BlurFilter):
+        preset.current_config()  # refuses what `load_preset` would
+        get_filter(preset.name)
+        preset = Preset(filter=preset.name, params=preset.changed_params())
     save_yaml(path, preset.model_dump(), comment=comment, overwrite=overwrite)
 
 
@@ -88,7 +99,8 @@ def create_filter(
             filter if left out.
         engine: "auto", "eager" or "compiled"; see `BlurFilter`.
         storage: "full" or "half"; see `BlurFilter`.
-        **params: Single parameters over the preset's: ``num_samples=15, kappa=30.0``.
+        **params: Single parameters over the preset's: ``num_samples=15, kappa=30.0``. `shutter`
+            may be a `Shutter`, which brings its position.
 
     Returns:
         A Module: ``blur(frame) -> (B, 3, H, W)``.
@@ -100,8 +112,8 @@ def create_filter(
         >>> create_filter("guertin2014", num_samples=15, kappa=30.0)
         Guertin2014Blur(num_samples=15, kappa=30.0)
     """
-    name = str(name_or_preset)
-    if name not in registered_filters() and (Path(name).suffix or Path(name).exists()):
+    name, params = str(name_or_preset), with_shutter(params)
+    if (Path(name).suffix or Path(name).exists()) and name not in list_filters():
         preset = load_preset(name)
         name, params = preset.filter, preset.params | params
     return get_filter(name)(None, engine=engine, storage=storage, **params)

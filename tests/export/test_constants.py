@@ -8,11 +8,11 @@ import pytest
 
 from torchblur.errors import ConfigError, OutputError
 from torchblur.export import constants_of, constants_text, write_constants
-from torchblur.filters import get_filter, registered_filters
+from torchblur.filters import get_filter, list_filters
 from torchblur.params import choices, declared
 from torchblur.presets import Preset, create_filter, load_preset
 
-FILTERS = sorted(registered_filters())
+FILTERS = sorted(list_filters())
 CONST = {"hlsl": r"static const", "glsl": r"const"}
 
 

@@ -8,7 +8,7 @@ from tiny_shots import moving_square
 
 from torchblur.errors import ConfigError, FrameError, OutputError, ReachWarning
 from torchblur.export import EXPORTABLE, export_program, save_program
-from torchblur.filters import get_filter, registered_filters
+from torchblur.filters import get_filter, list_filters
 from torchblur.frame import Frame
 from torchblur.ops.pixels import PixelList, all_pixels
 from torchblur.presets import create_filter
@@ -145,7 +145,7 @@ class TestProgram:
 
 
 class TestRefused:
-    @pytest.mark.parametrize("name", sorted(set(registered_filters()) - set(EXPORTABLE)))
+    @pytest.mark.parametrize("name", sorted(set(list_filters()) - set(EXPORTABLE)))
     def test_filters_that_decide_by_values(self, frame, name):
         with pytest.raises(ConfigError, match=rf"`{name}` cannot be exported.*guertin2014, jimen"):
             export_program(get_filter(name)(), frame)

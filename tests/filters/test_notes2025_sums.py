@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from torchblur.filters import get_filter
-from torchblur.filters.notes2025_gather import Sums, compose
+from torchblur.filters.front_back import Sums, compose
 from torchblur.testing.frames import moving_square
 
 

@@ -6,7 +6,7 @@ import torch
 from torchblur.errors import FrameError
 from torchblur.filters.base import History
 from torchblur.filters.oberberger2022 import Oberberger2022Blur, oberberger2022
-from torchblur.frame import Frame, Sequence
+from torchblur.frame import Frame, FrameSequence
 from torchblur.testing.contract import FilterContract
 from torchblur.testing.frames import as_stream, moving_square, random_frame
 from torchblur.testing.probes import mirrored, mirrored_frame
@@ -210,9 +210,9 @@ def test_a_cut_leaves_no_ghost():
     frames = tuple(plane.stream(i) for plane in (first, second) for i in range(2))
     blur = Oberberger2022Blur(shutter=1.0)
     with torch.no_grad():
-        cut = blur.sequence(Sequence(frames, cuts=(2,)))
-        ghost = blur.sequence(Sequence(frames))
-        fresh = blur.sequence(Sequence(frames[2:]))
+        cut = blur.sequence(FrameSequence(frames, cuts=(2,)))
+        ghost = blur.sequence(FrameSequence(frames))
+        fresh = blur.sequence(FrameSequence(frames[2:]))
     assert torch.equal(cut[2], fresh[0])
     assert torch.equal(cut[3], fresh[1])
     assert not torch.equal(ghost[2], fresh[0])
@@ -240,7 +240,7 @@ def test_a_sequence_equals_the_loop():
     frames = tuple(SQUARE.stream(i) for i in range(3))
     blur = Oberberger2022Blur(shutter=1.0)
     history = None
-    for frame, color in zip(frames, blur.sequence(Sequence(frames)), strict=True):
+    for frame, color in zip(frames, blur.sequence(FrameSequence(frames)), strict=True):
         expected, history = blur(frame, history)
         assert torch.equal(color, expected)
 
@@ -262,10 +262,11 @@ def test_a_batch_with_a_history_equals_single_runs():
     planes = [PLANE, TexturedPlane((-5.0, 6.0), size=PLANE.size, square=12.0)]
     blur = Oberberger2022Blur(shutter=1.0)
     single = [
-        torch.stack(blur.sequence(Sequence(tuple(p.stream(i) for i in range(3))))) for p in planes
+        torch.stack(blur.sequence(FrameSequence(tuple(p.stream(i) for i in range(3)))))
+        for p in planes
     ]
     together = blur.sequence(
-        Sequence(tuple(Frame.stack([p.stream(i) for p in planes]) for i in range(3)))
+        FrameSequence(tuple(Frame.stack([p.stream(i) for p in planes]) for i in range(3)))
     )
     assert torch.allclose(torch.stack(together), torch.cat(single, 1), atol=1e-6)
 
@@ -393,7 +394,7 @@ def test_the_gradient_of_the_history_limit_comes_through_time():
 
     def grad(count, **options):
         blur.zero_grad()
-        colors = blur.sequence(Sequence(frames[:count]), **options)
+        colors = blur.sequence(FrameSequence(frames[:count]), **options)
         colors[-1].square().mean().backward()
         return float(blur.history_limit.grad or 0.0)
 
@@ -409,7 +410,7 @@ def test_detaching_truncates_the_gradient():
     def reach(detach_every):
         leaves = [f.color.clone().requires_grad_() for f in frames]
         shot = tuple(dataclasses.replace(f, color=c) for f, c in zip(frames, leaves, strict=True))
-        last = blur.sequence(Sequence(shot), detach_every=detach_every)[-1]
+        last = blur.sequence(FrameSequence(shot), detach_every=detach_every)[-1]
         grads = torch.autograd.grad(last.sum(), leaves, allow_unused=True)
         return [g is not None and bool(g.any()) for g in grads]
 

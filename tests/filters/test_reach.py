@@ -7,6 +7,7 @@ from torchblur.errors import ReachWarning
 from torchblur.filters import get_filter
 from torchblur.filters import reach as reach_module
 from torchblur.filters.base import Values
+from torchblur.filters.moving import least_spread
 from torchblur.filters.reach import by_length, tap_counts
 from torchblur.frame import Frame
 from torchblur.ops import gather as gather_module
@@ -329,3 +330,43 @@ def test_half_resolution_reaches_as_far():
         ends.append((int(row.min()), int(row.max())))
     assert abs(ends[0][0] - ends[1][0]) <= 4
     assert abs(ends[0][1] - ends[1][1]) <= 4
+
+
+def test_post_filter_of_the_notes_closes_the_gaps_that_long_paths_have():
+    # 12 taps at most 6 px apart are 24 on this path: as if 24 had been asked for.
+    frame = constant_motion((240.0, 0.0), 6, 400)
+    shared = {"reach": "frame", "tile_size": 10, "center_weight": 0.0, "noise": "none"}
+    shared |= {"post_alpha": "output"}  # 1 everywhere: all samples count
+    denser = make("notes2025", num_samples=12, tap_spacing=6.0, **shared)(frame)
+    asked = make("notes2025", num_samples=24, **shared)(frame)
+    assert torch.allclose(denser, asked, atol=1e-5)
+    assert not torch.allclose(denser, make("notes2025", num_samples=12, **shared)(frame), atol=1e-2)
+
+
+def test_second_pass_of_sousa_closes_the_gaps_that_long_paths_have():
+    # Taps of the first pass are 12 px apart, with tap_spacing 6: the second spreads no farther.
+    frame = constant_motion((240.0, 0.0), 4, 400)
+    color = torch.zeros_like(frame.color)
+    color[..., 200] = 1.0
+    blur = make("sousa2013", reach="frame", tile_size=10, tap_spacing=6.0, color_lookup="bilinear")
+    layers = blur.layers(frame.replaced(color=color))
+    first, last = ((layers[key][0, 0, 2] > 1e-4).nonzero() for key in ("first_pass", "color"))
+    assert 0 < int(first.min() - last.min()) <= 4
+    assert 0 < int(last.max() - first.max()) <= 4
+
+
+@pytest.mark.parametrize("reach", ["tile", "frame"])
+def test_what_lies_along_the_second_direction_counts_as_within_reach(reach):
+    # All moves, but for a still patch that only the second direction's taps meet.
+    least = torch.ones(1, 1, 40, 40)
+    least[..., 32:, 16:24] = 0.0
+    sideways, down = torch.zeros(2, 1, 2, 5, 5)
+    sideways[:, 0], down[:, 1] = 8.0, 24.0
+    given = Values(
+        tile_size=8, reach=reach, max_reach=64.0, tap_spacing=0.0, shutter_position="centered"
+    )
+    one, two = (
+        least_spread(least, along, given)[0, 0, 1, 2] for along in ((sideways,), (sideways, down))
+    )
+    assert float(one) == 1.0
+    assert float(two) == (0.0 if reach == "frame" else 1.0)

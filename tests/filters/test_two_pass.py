@@ -2,7 +2,7 @@ import pytest
 import torch
 
 from torchblur.errors import ConfigError
-from torchblur.filters import FilterConfig, TwoPassBlur, get_filter, registered_filters
+from torchblur.filters import FilterConfig, TwoPassBlur, get_filter, list_filters
 from torchblur.filters.line import LineBlur
 from torchblur.frame import Frame
 from torchblur.testing.frames import constant_motion, moving_square, random_frame
@@ -62,7 +62,7 @@ def test_the_second_pass_is_the_filter_on_the_result_of_the_first():
 
 
 @pytest.mark.filterwarnings("ignore:tan2022. no layer:UserWarning")
-@pytest.mark.parametrize("name", [n for n, f in registered_filters().items() if not f.needs])
+@pytest.mark.parametrize("name", [n for n, f in list_filters().items() if not f.needs])
 def test_every_filter_of_plain_frames_can_be_wrapped(name):
     frame = random_frame()
     still = frame.map(lambda t: torch.zeros_like(t) if t.shape[1] == 2 else t)

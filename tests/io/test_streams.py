@@ -6,6 +6,7 @@ import re
 import pytest
 import torch
 
+import torchblur
 from torchblur.errors import ConfigError, FileFormatError, FrameError
 from torchblur.frame import Frame
 from torchblur.io import (
@@ -119,10 +120,25 @@ def test_other_sequences_of_a_folder_by_name(folder):
         write_frame(folder / f"sharp.{number:04d}.exr", sharp)
     second = read_sequence(folder, name="stream02")
     assert torch.equal(second[1].color, stream_frame(21).color)
-    sharp = read_sequence(folder, name="sharp", needs=())
+    sharp = read_sequence(folder, name="sharp")
     assert torch.equal(sharp[0].color, stream_frame(40).color)
     with pytest.raises(FileFormatError, match=r"sharp\.0000\.exr has no layer `time`.*needs=\(\)"):
-        read_sequence(folder, name="sharp")
+        read_sequence(folder, name="sharp", needs=("time",))
+    write_frame(folder / "stream.0003.exr", sharp[0], overwrite=True)
+    with pytest.raises(FileFormatError, match=r"stream\.0003\.exr has no layer `time`"):
+        read_sequence(folder)
+
+
+def test_files_in_an_order_of_their_own(folder):
+    paths = [folder / "stream.0006.exr", str(folder / "stream.0003.exr")]
+    sequence = torchblur.read_sequence(paths, cuts=(1,))
+    assert [frame.source for frame in sequence] == [str(path) for path in paths]
+    assert torch.equal(sequence[1].color, stream_frame(3).color)
+    assert len(read_sequence(iter(paths))) == 2
+    with pytest.raises(FileFormatError, match=r"no frames fit .*gone\.exr"):
+        read_sequence([folder / "gone.exr"])
+    with pytest.raises(FileFormatError, match="at least one file, got none"):
+        read_sequence([])
 
 
 def test_a_g_buffer_beside_a_stream_is_not_its_own(folder):

@@ -209,3 +209,19 @@ def test_bad_calls():
     flat = Frame(color=frame.color, velocity=frame.velocity)
     with pytest.raises(FrameError, match="`depth` is needed and is missing"):
         whole(flat)
+
+
+def test_a_state_brings_the_order_of_the_steps():
+    steps = ("bloom", "fxaa")
+    whole = FramePipeline(PipelineConfig(steps=steps, fxaa_luma="color"))
+    other = FramePipeline(PipelineConfig(steps=steps[::-1]))
+    other.load_state_dict(whole.state_dict())
+    frame = moving_square()
+    assert other.config == whole.config
+    assert torch.equal(other(frame), whole(frame))
+    with pytest.raises(ConfigError, match=r"of its steps, bloom, fxaa, got fxaa$"):
+        FramePipeline(PipelineConfig(steps=("fxaa",))).load_state_dict(whole.state_dict())
+    old = {k: v for k, v in whole.state_dict().items() if k != "_extra_state"}
+    kept = FramePipeline(PipelineConfig(steps=steps[::-1]))
+    kept.load_state_dict(old)
+    assert kept.config.steps == steps[::-1]

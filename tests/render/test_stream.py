@@ -7,7 +7,7 @@ import torch
 from scipy.stats import kstest, norm
 
 from torchblur.errors import ConfigError
-from torchblur.frame import Sequence, Shutter
+from torchblur.frame import FrameSequence, Shutter
 from torchblur.render import Renderer, load_scene, render_frame, render_reference, render_stream
 from torchblur.render.trace import Tracer
 
@@ -252,7 +252,7 @@ def test_more_samples_begin_with_the_same(crossing):
 
 
 def test_frames_make_a_sequence(crossing):
-    sequence = Sequence(tuple(crossing.stream((6, 10), frame=f)[0] for f in range(3)))
+    sequence = FrameSequence(tuple(crossing.stream((6, 10), frame=f)[0] for f in range(3)))
     assert len(sequence) == 3
     assert set(sequence[2].layers()) == LAYERS
 

@@ -6,7 +6,7 @@ import pytest
 from planted import FIXED, PLANTED, planted_case, write_planted
 from planted_sequences import Recall
 
-import torchblur.filters.base
+import torchblur.filters.registry
 from torchblur.filters import get_filter
 from tuning.config.objective import ObjectiveSpec
 from tuning.objective.problem import Problem
@@ -38,5 +38,5 @@ def planted_folders(tmp_path):
 @pytest.fixture
 def recall(monkeypatch):
     """The stand-in filter with a memory, by its name "recall"."""
-    monkeypatch.setitem(torchblur.filters.base._REGISTRY, Recall.name, Recall)
+    monkeypatch.setitem(torchblur.filters.registry._REGISTRY, Recall.name, Recall)
     return Recall

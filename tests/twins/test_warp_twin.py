@@ -57,7 +57,8 @@ def both(frame, params):
     planes, layers = arrays(frame)
     # The parameters as the filter holds them, which is in single precision.
     settings = blur.config.model_dump()
-    settings |= {name: float(value) for name, value in blur.state_dict().items()}
+    numbers = [*blur.named_parameters(), *blur.named_buffers()]
+    settings |= {name: float(value) for name, value in numbers}
     with torch.no_grad():
         return blur.layers(frame), warp(*planes, **layers, **settings)
 

@@ -10,7 +10,6 @@ import json
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Literal, get_args
 
@@ -22,6 +21,7 @@ from torchblur.filters import get_filter
 from torchblur.io.paths import output_file
 from torchblur.params import build, choices, declared
 from torchblur.presets import Preset
+from torchblur.version import __version__
 
 __all__ = ["Constant", "ConstantsFormat", "constants_of", "constants_text", "write_constants"]
 
@@ -129,7 +129,7 @@ def constants_text(
     return shader_text(
         [vars(constant) for constant in constants],
         file_format,
-        head=header_lines(preset.filter, name, preset.evidence, version("torchblur")),
+        head=header_lines(preset.filter, name, preset.evidence, __version__),
         guard=f"{prefix}{preset.filter}_constants",
         prefix=prefix,
     )
@@ -165,7 +165,7 @@ def write_constants(
 
 def _json(preset: Preset, constants: tuple[Constant, ...], name: str) -> str:
     document = {
-        "torchblur": version("torchblur"),
+        "torchblur": __version__,
         "filter": preset.filter,
         "preset": name or None,
         "parameters": [_described(constant) for constant in constants],

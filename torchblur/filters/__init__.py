@@ -6,14 +6,9 @@ Every module of this package is imported here, so that a new file registers its 
 from importlib import import_module
 from pkgutil import iter_modules
 
-from torchblur.filters.base import (
-    BlurFilter,
-    FilterConfig,
-    History,
-    TemporalBlur,
-    get_filter,
-    registered_filters,
-)
+from torchblur.filters.base import BlurFilter, FilterConfig, History, TemporalBlur
+from torchblur.filters.registry import get_filter, list_filters, load_plugin, register_filter
+from torchblur.filters.registry import registered_filters as registered_filters
 from torchblur.filters.two_pass import TwoPassBlur
 
 for _module in iter_modules(__path__):
@@ -26,5 +21,7 @@ __all__ = [
     "TemporalBlur",
     "TwoPassBlur",
     "get_filter",
-    "registered_filters",
+    "list_filters",
+    "load_plugin",
+    "register_filter",
 ]

@@ -1,4 +1,4 @@
-"""What all filters share: the shutter, the Module over a function, the registry.
+"""What all filters share: the shutter, and the Module over a function.
 
 A filter is three things in one file: a `FilterConfig` (its parameters, each declared once), a
 function of a frame and the parameters' values, and a `BlurFilter` that holds the values as
@@ -16,24 +16,16 @@ from typing import Annotated, Any, ClassVar, get_args
 from torch import Tensor
 
 from torchblur.configured import ConfiguredModule, Values, batch_size_of
-from torchblur.errors import ConfigError, nearest_name
-from torchblur.frame import LONGEST_SHUTTER, Frame, Sequence, Shutter, ShutterPosition
+from torchblur.errors import ConfigError
+from torchblur.filters.registry import register_filter
+from torchblur.frame import LONGEST_SHUTTER, Frame, FrameSequence, Shutter, ShutterPosition
 from torchblur.ops.compiling import EngineChoice, compiler_works, worth_compiling
 from torchblur.ops.gather import Engine, Storage, stored_as
 from torchblur.params import Config, Param
 
-__all__ = [
-    "BlurFilter",
-    "FilterConfig",
-    "History",
-    "TemporalBlur",
-    "Values",
-    "get_filter",
-    "registered_filters",
-]
+__all__ = ["BlurFilter", "FilterConfig", "History", "TemporalBlur", "Values", "with_shutter"]
 
 _TAPS = 16  # of a filter that does not say how many it has
-_REGISTRY: dict[str, type[BlurFilter]] = {}
 
 
 class FilterConfig(Config):
@@ -75,7 +67,8 @@ class BlurFilter(ConfiguredModule):
             call); or "auto": compiled for a `sequence` that is worth it, eager else.
         storage: "half" keeps what the taps look up in 16 bits: less memory traffic, where that is
             the limit; see `ops.gather.stored_as` for the error.
-        **params: Single parameters by name, over those of `config`.
+        **params: Single parameters by name, over those of `config`; `shutter` may be a `Shutter`,
+            which brings its position.
 
     Raises:
         ConfigError: unknown name, or a value out of range.
@@ -83,6 +76,7 @@ class BlurFilter(ConfiguredModule):
 
     config_class: ClassVar[type[FilterConfig]]
     config: FilterConfig
+    _config_base: ClassVar[type[Config]] = FilterConfig
     published: ClassVar[bool] = True
     """Whether the defaults are those of a paper; else they are ours."""
     needs: ClassVar[tuple[str, ...]] = ()
@@ -94,7 +88,7 @@ class BlurFilter(ConfiguredModule):
     def __init_subclass__(cls, **kwargs: Any) -> None:
         super().__init_subclass__(**kwargs)
         if "name" in cls.__dict__:
-            _REGISTRY[cls.name] = cls
+            register_filter(cls)
 
     def __init__(
         self,
@@ -104,7 +98,7 @@ class BlurFilter(ConfiguredModule):
         storage: Storage = "full",
         **params: Any,
     ) -> None:
-        super().__init__(config, **params)
+        super().__init__(config, **with_shutter(params))
         self._engine: EngineChoice = engine
         if storage not in get_args(Storage):
             raise ConfigError(f"`storage` must be 'full' or 'half', got {storage!r}")
@@ -121,8 +115,13 @@ class BlurFilter(ConfiguredModule):
 
     @property
     def shutter_setting(self) -> Shutter:
-        """The shutter as the config has it."""
-        return Shutter(self.config.shutter, self.config.shutter_position)
+        """The shutter as it is now."""
+        now = self._now()
+        return Shutter(now["shutter"], now["shutter_position"])
+
+    def values_for(self, color: Tensor, overrides: dict[str, Any] | None = None) -> Values:
+        """Return the values for one call, as the base does; a `Shutter` stands for two of them."""
+        return super().values_for(color, with_shutter(overrides or {}))
 
     def layers(self, frame: Frame, **overrides: Any) -> dict[str, Tensor]:
         """Return everything the filter computes, by name; "color" is the result.
@@ -180,6 +179,27 @@ class BlurFilter(ConfiguredModule):
         per_frame = given if self.per_frame is None else {k: given[k] for k in self.per_frame}
         batch_size = batch_size_of(Values(**per_frame), frame.batch_size)
         return frame if batch_size == frame.batch_size else frame.expand(batch_size), values
+
+
+def with_shutter(params: abc.Mapping[str, Any]) -> dict[str, Any]:
+    """Return parameters in which a `Shutter` is its open time and its position.
+
+    Args:
+        params: Values by name; `shutter` may be a `Shutter`.
+
+    Raises:
+        ConfigError: `shutter_position` is given beside it, and another.
+    """
+    shutter = params.get("shutter")
+    if not isinstance(shutter, Shutter):
+        return dict(params)
+    position = params.get("shutter_position", shutter.position)
+    if position != shutter.position:
+        raise ConfigError(
+            f"`shutter_position` must be that of the `shutter`, {shutter.position!r}, got "
+            f"{position!r}; leave it out"
+        )
+    return {**params, "shutter": float(shutter.open), "shutter_position": position}
 
 
 def _one_per_set(color: Tensor, values: Values) -> Tensor:
@@ -262,7 +282,7 @@ class TemporalBlur(BlurFilter):
         return layers["color"], history
 
     def sequence(
-        self, sequence: Sequence, *, detach_every: int | None = None, **overrides: Any
+        self, sequence: FrameSequence, *, detach_every: int | None = None, **overrides: Any
     ) -> list[Tensor]:
         """Return the blurred color of each frame, (B, 3, H, W) each; memory ends at cuts.
 
@@ -289,22 +309,3 @@ class TemporalBlur(BlurFilter):
                 history = history.detach()
             colors.append(color)
         return colors
-
-
-def registered_filters() -> dict[str, type[BlurFilter]]:
-    """Return the filters by name."""
-    return dict(sorted(_REGISTRY.items()))
-
-
-def get_filter(name: str) -> type[BlurFilter]:
-    """Return a filter's class by its registered name.
-
-    Raises:
-        ConfigError: if there is none; names the nearest.
-    """
-    if name not in _REGISTRY:
-        raise ConfigError(
-            f"unknown filter `{name}`{nearest_name(name, _REGISTRY)}; "
-            f"filters: {', '.join(sorted(_REGISTRY))}"
-        )
-    return _REGISTRY[name]

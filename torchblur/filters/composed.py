@@ -1,4 +1,4 @@
-"""torchblur's own filter: the parts of the published ones, and samples that arrive on time."""
+"""The published filters in one: every part of theirs is a parameter, and they are sets of them."""
 
 from __future__ import annotations
 
@@ -11,23 +11,23 @@ from torch import Tensor
 from torchblur.filters.base import Values
 from torchblur.filters.composed_config import ComposedConfig
 from torchblur.filters.composed_gather import (
+    TAP_PARAMETERS,
     TapOptions,
     alternate_tap,
     pair_tap,
-    shared_inputs,
     tap_options,
 )
-from torchblur.filters.composed_motion import clean_edges, half_spreads
-from torchblur.filters.composed_times import fill_hidden, time_tap
+from torchblur.filters.front_back import Blurred, Sums, compose, over_nothing, tap_inputs
 from torchblur.filters.guertin2014 import center_direction
-from torchblur.filters.moving import moving_pixels, packed_values, tile_planes
-from torchblur.filters.notes2025_gather import Blurred, Line, Sums, compose
+from torchblur.filters.moving import least_spread, moving_pixels, packed_values, tile_planes
+from torchblur.filters.notes2025_gather import Line
 from torchblur.filters.notes2025_postfilter import post_filter
 from torchblur.filters.places import SHORTEST_REACH, num_pairs
 from torchblur.filters.reach import Gather, ReachingBlur, by_length, tap_counts
 from torchblur.filters.reconstruction import color_from, resolve, texture_of
 from torchblur.filters.revealed import revealed_inputs
 from torchblur.filters.spreads import Spread
+from torchblur.filters.torchblur_motion import clean_edges, half_spreads
 from torchblur.frame import Frame
 from torchblur.ops.gather import Engine, Inputs, components, gather_lists
 from torchblur.ops.pixels import PixelList
@@ -35,31 +35,16 @@ from torchblur.ops.velocity import direction, length
 from torchblur.ops.weights import power, saturate
 
 __all__ = ["ComposedBlur", "ComposedConfig", "composed"]
-_TRACE = 1e-6  # weight per tap
 
 
 def composed(frame: Frame, config: ComposedConfig | None = None, **params: Any) -> Tensor:
-    """Blur with torchblur's own filter, whose special cases are published ones.
+    """Blur with the space of the published filters: each is a set of this one's parameters.
 
-    The taps are times. At time t four samples compete for a pixel at x: those that the tile's
-    dominant motion, the same reversed, its second motion and the pixel's own would bring there,
-    ``S = x − t v``. Each then follows the motion that it finds there instead (`refinements`). Its
-    match says whether it arrives on time, and the nearer hide the others:
-
-    ``m = sat(1 − |V_S − v| |t| / (match_tolerance + match_slope |v t|))``,
-    ``w_k = m_k Π_j (1 − m_j f_kj)``,  ``f_kj = 1 − sat(level + (Z_j − Z_k) / extent)``.
-
-    The front's share of this time is ``c = 1 − Π (1 − m_k)``, its color ``Σ w_k C_k / Σ w_k``, or
-    with `arrivals` "winner" the color of the greatest w_k, which takes one lookup. Where nothing
-    arrives, a surface has left the pixel and lets the back through: the tap on the pixel's own
-    line, as far as it lies behind. With ``α = Σ c / N`` the result is
-    ``α front + (1 − α) back``, each normalized; without a back it is the front alone. Times at
-    which something nearer hides that line are filled with what passes the pixel and is not in
-    front of it (`hidden_times`).
-
-    With `sampling` "alternate" and "pairs" taps have the published weights in place of matches,
-    depth × spread × direction, and `resolve` has three ways to make a color of the sums.
-    `composed_cases.special_case` gives the parameters with which this filter is another one.
+    The weight of a tap is depth × spread × direction, each in the forms that the texts have, plus
+    the third weight of McGuire 2012 or Guertin 2014. Taps take one direction by turns (`sampling`
+    "alternate") or lie in pairs on both sides of the pixel in each direction ("pairs"), and
+    `resolve` has three ways to make a color of the sums. `composed_cases.special_case` gives the
+    parameters with which this filter is a published one; what lies between them can be fitted.
 
     Args:
         frame: Color, depth and velocity, (B, ·, H, W).
@@ -69,16 +54,15 @@ def composed(frame: Frame, config: ComposedConfig | None = None, **params: Any) 
     Returns:
         Color, scene-linear, (B, 3, H, W).
 
-    Differentiable: in color, in depth, in the velocity (through the matches and through the
-        positions of the color lookups; motion and depth are looked up at the nearest pixel), and
-        in every parameter that `torchblur params` calls smooth.
+    Differentiable: in color, in depth, in the velocity through the weights and through the
+        positions of lookups that are not nearest, and in every parameter that `torchblur params`
+        calls smooth.
     Border: replicated.
-    Reference: torchblur. Parts of McGuire 2012, Guertin 2014, Jimenez 2014 and the 2025 notes, as
-        each parameter says; following the motion that a tap finds is the fixed-point iteration of
-        Bowles et al. 2012 (Iterative Image Warping); `edge_motion` is known from temporal
-        anti-aliasing (Karis 2014). Not special cases: the second pass of Sousa 2013, which filters
-        a result (`TwoPassBlur` does that with any filter), half resolution of the 2025 notes, and
-        taps assigned by the variance of tiles (Guertin 2014).
+    Reference: McGuire 2012, Guertin 2014, Jimenez 2014 and the 2025 notes, as each parameter says;
+        `edge_motion` is known from temporal anti-aliasing (Karis 2014). Not special cases: the
+        second pass of Sousa 2013, which filters a result (`TwoPassBlur` does that with any filter),
+        half resolution of the 2025 notes, and taps assigned by the variance of tiles (Guertin
+        2014).
     Raises: ConfigError for a bad parameter, FrameError if the frame has no depth.
     """
     result: Tensor = ComposedBlur(config, **params)(frame)
@@ -86,26 +70,16 @@ def composed(frame: Frame, config: ComposedConfig | None = None, **params: Any) 
 
 
 class ComposedBlur(ReachingBlur):
-    """torchblur's own filter; the published ones are sets of its parameters. See `composed`.
+    """The published filters in one: they are sets of its parameters. See `composed`.
 
     `layers` adds "alpha" (the front's share; with one sum the mean weight), "output_alpha" (how
     much replaces the pixel's own color) and "weight" (the mean weight of all taps), (B, 1, H, W),
     and "primary" and "secondary" (half spread per tile in px, (B, 2, Ty, Tx)).
     """
 
-    name = "torchblur"
+    name = "composed"
     published = False
     config_class = ComposedConfig
-
-    def engine_for(self, pixels: float) -> Engine:
-        """Return the engine that suits an amount of work: "auto" is the eager one.
-
-        The backward of taps that are times takes minutes to compile.
-
-        Args:
-            pixels: Of all calls together.
-        """
-        return self.engine
 
     def compute(self, frame: Frame, values: Values) -> dict[str, Tensor]:
         """Return "color", the alphas, "weight" and the tiles."""
@@ -121,19 +95,22 @@ def _layers(frame: Frame, values: Values, engine: Engine) -> dict[str, Tensor]:
         planes = dict.fromkeys(("alpha", "output_alpha", "weight"), none)
         return {"color": frame.color} | planes | tiles._asdict()
     here, local = seen.only("depth", "valid").map(pixels.pack), packed_values(values, pixels)
-    first, second, least = tile_planes(seen.color, spread.length, tiles, pixels, values)
-    inputs = shared_inputs(here, texture_of(seen, spread), pixels, local)
-    first_channel = color_from(seen, spread)
+    motions: list[Tensor] = [*tiles]
+    if values.double_samples or values.tile_classes or values.color_lookup == "opportunistic":
+        motions.append(least_spread(spread.length, tiles, values))
+    first, second, *least = tile_planes(seen.color, motions, pixels, values)
+    first_channel, texture = color_from(seen, spread), texture_of(seen, spread)
     spread = Spread(*(pixels.pack(plane) for plane in spread))
-    inputs |= components("half", spread.half) | {"length": spread.length}
-    inputs["linear"] = (least >= local.bilinear_min).to(frame.dtype)
-    inputs["fast"] = (least >= local.fast_ratio * length(first)).to(frame.dtype)
+    inputs = tap_inputs(here, texture, spread, pixels, local, TAP_PARAMETERS)
+    for shortest in least:
+        inputs["linear"] = (shortest >= local.bilinear_min).to(frame.dtype)
+        inputs["fast"] = (shortest >= local.fast_ratio * length(first)).to(frame.dtype)
     inputs |= pixels.lists(
         revealed_inputs(frame, values, lambda f, v: _layers(f, v, engine)["color"])
     )
     moving = length(first) > local.early_out
     ways = _ways(first, second, spread, local)
-    lines = _lines(ways, inputs["linear"] > 0, moving, local)
+    lines = _lines(ways, inputs.get("linear"), moving, local)
     sums = _gather(ways, lines, inputs, pixels, local, engine, first_channel)
     image = _resolve(here, sums, spread, moving, local).images(frame, pixels)
     if values.post_filter:
@@ -155,8 +132,6 @@ class _Way(NamedTuple):
     """Half spread that the taps cover, px, (B, 1, H, W)."""
     agrees: Tensor
     """Weight of the pixel's own direction along it, in [0, 1], (B, 1, H, W)."""
-    vector: Tensor
-    """Half spread that a sample must have, px, (B, 2, H, W)."""
 
     def line(self, prefix: str = "") -> Inputs:
         """Return what taps along it need."""
@@ -175,37 +150,34 @@ def _ways(first: Tensor, second: Tensor, spread: Spread, values: Values) -> dict
     if values.tap_length == "tile":
         own_reach = reach
     along = {
-        "first": (tile, reach, first),
-        "own": (own, own_reach, spread.half),
-        "second": (direction(second), length(second), second),
-        "reversed": (-tile, reach, -first),
+        "first": (tile, reach),
+        "own": (own, own_reach),
+        "second": (direction(second), length(second)),
     }
     wanted = [name for name in along if vars(values)[f"{name}_direction"]] or ["own"]
-    if values.sampling != "times":  # the others look to both sides anyway
-        wanted = [name for name in wanted if name != "reversed"] or ["own"]
     ways = {}
     for name in wanted:
-        unit, far, vector = along[name]
+        unit, far = along[name]
         against = tile if values.own_direction_against == "tile" else unit
         cosine = (own * against).sum(1, keepdim=True).abs()
         if name == "own" and values.own_direction_against == "tap":
             cosine = torch.ones_like(cosine)
-        ways[name] = _Way(unit, far, power(cosine, values.direction_exponent), vector)
+        ways[name] = _Way(unit, far, power(cosine, values.direction_exponent))
     return ways
 
 
 def _lines(
-    ways: dict[str, _Way], linear: Tensor, moving: Tensor, values: Values
+    ways: dict[str, _Way], linear: Tensor | None, moving: Tensor, values: Values
 ) -> dict[str, Line]:
     """Return where each direction is sampled, and how densely if in pairs."""
     pairs = num_pairs(values)
     lines = {}
-    if len(ways) > 1:
-        ways = {name: way for name, way in ways.items() if name != "reversed"}
     for number, (name, way) in enumerate(ways.items()):
-        plane, most, used = tap_counts(values, way.reach, pairs), pairs, moving
-        if number == 0 and values.double_samples and values.sampling == "pairs":
-            plane, most = torch.where(linear, plane, 2 * plane), 2 * pairs
+        plane, most, used = torch.full_like(way.reach, float(pairs)), pairs, moving
+        if values.sampling == "pairs":
+            plane = tap_counts(values, way.reach, pairs)
+            if number == 0 and values.double_samples and linear is not None:
+                plane, most = torch.where(linear > 0, plane, 2 * plane), 2 * pairs
         if name == "second" and "first" in ways:
             cosine = (ways["first"].unit * way.unit).sum(1, keepdim=True).abs()
             apart = cosine < torch.cos(values.min_angle * (math.pi / 180))
@@ -244,14 +216,13 @@ def _gather(
         return found
     name, way = next(iter(ways.items()))
     line = lines[name]
-    count = torch.full_like(line.pairs, float(values.num_samples))
-    inputs, timed = dict(shared), values.sampling == "times"
+    count = torch.full_like(way.reach, float(values.num_samples))
+    inputs = dict(shared)
     for name, one in ways.items():
-        inputs |= components(f"{name}_vector", one.vector) if timed else one.line(f"{name}_")
-    tap = time_tap if timed else alternate_tap
+        inputs |= one.line(f"{name}_")
     totals = by_length(
         lambda taps, lists, some: gather_lists(
-            tap, options, taps, lists, some, engine, color_from=first_channel
+            alternate_tap, options, taps, lists, some, engine, color_from=first_channel
         ),
         values,
         _longest(ways, shared),
@@ -259,10 +230,7 @@ def _gather(
         pixels,
         values.num_samples,
     )
-    if options.fill_hidden and timed:
-        totals = (*fill_hidden(totals[0], totals[1], values.background_gain), *totals[2:])
-    spreads = values.accurate_alpha and values.sampling == "alternate"
-    area = values.area_slope * way.reach if spreads else None
+    area = values.area_slope * way.reach if values.accurate_alpha else None
     return [_means(totals, count, line, area, values)]
 
 
@@ -284,7 +252,7 @@ def _longest(ways: dict[str, _Way], shared: Inputs) -> Tensor:
     """Return half of the longest path among the directions and the pixel's own, px."""
     longest = shared["length"]
     for way in ways.values():
-        longest = torch.maximum(longest, length(way.vector))
+        longest = torch.maximum(longest, way.reach)
     return longest
 
 
@@ -314,19 +282,9 @@ def _resolve(
         "resolution": "full",
     }
     if values.missing_background == "foreground":
-        sums = _over_nothing(sums, values)
+        sums = over_nothing(sums, values)
         changed["background_fade"] = 0.0
     return compose(frame, sums, moving, Values(**(vars(values) | changed)))
-
-
-def _over_nothing(sums: list[Sums], values: Values) -> list[Sums]:
-    """Return the sums with the front opaque where there is no back."""
-    background = torch.stack([one.background for one in sums]).sum(0)
-    # Rounding leaves a trace of a back where something arrives at every time.
-    shown = (background > _TRACE).to(background.dtype)
-    if values.background_fade > 0:
-        shown = saturate(background / values.background_fade, values.softness)
-    return [one._replace(alpha=1 - (1 - one.alpha) * shown) for one in sums]
 
 
 def _normalized(

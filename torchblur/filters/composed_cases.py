@@ -6,13 +6,14 @@ from collections.abc import Callable
 from typing import Any
 
 from torchblur.errors import ConfigError
-from torchblur.filters.base import FilterConfig, get_filter
+from torchblur.filters.base import FilterConfig
 from torchblur.filters.composed_config import ComposedConfig
 from torchblur.filters.guertin2014_config import Guertin2014Config
 from torchblur.filters.jimenez2014_config import Jimenez2014Config
 from torchblur.filters.mcguire2012 import McGuire2012Config
 from torchblur.filters.notes2025_config import Notes2025Config
 from torchblur.filters.reconstruction import WEIGHT_PARAMETERS, ReconstructionConfig
+from torchblur.filters.registry import get_filter
 from torchblur.params import build
 
 __all__ = ["SPECIAL_CASES", "special_case"]
@@ -63,7 +64,7 @@ def special_case(name: str, config: FilterConfig | None = None, **params: Any) -
     kind = get_filter(name).config_class
     start = {} if config is None else config.model_dump()
     published = build(kind, start | params, name)
-    return build(ComposedConfig, SPECIAL_CASES[name](published), f"torchblur, as {name}")
+    return build(ComposedConfig, SPECIAL_CASES[name](published), f"composed, as {name}")
 
 
 def _shared(config: FilterConfig, *names: str) -> dict[str, Any]:

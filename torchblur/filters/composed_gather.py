@@ -1,4 +1,4 @@
-"""Taps of torchblur's own filter: by turns, in pairs; weights and sums that all its taps share."""
+"""Taps of the composed filter: one direction by turns, or both sides of the pixel in pairs."""
 
 from __future__ import annotations
 
@@ -8,33 +8,14 @@ import torch
 from torch import Tensor
 
 from torchblur.filters.base import Values
-from torchblur.filters.places import tap_shift
-from torchblur.filters.reconstruction import (
-    TEXTURE_COLOR,
-    WEIGHT_PARAMETERS,
-    ColorLookup,
-    Tap,
-    is_one,
-    sample,
-)
-from torchblur.frame import Frame, Shutter
-from torchblur.ops.cubic import second_differences
-from torchblur.ops.gather import Inputs, Planes, vector, weighted
-from torchblur.ops.pixels import PixelList
+from torchblur.filters.front_back import Added, sample_classes, sum_planes
+from torchblur.filters.reconstruction import WEIGHT_PARAMETERS, ColorLookup, Tap, is_one, sample
+from torchblur.frame import Shutter
+from torchblur.ops.gather import Inputs, vector, weighted
 from torchblur.ops.spread import Mirror, SpreadForm, TapPair, mirror, spread_weight
-from torchblur.ops.weights import DepthWeights, cone, cylinder, depth_weights, power, saturate
+from torchblur.ops.weights import cone, cylinder, power, saturate
 
-__all__ = [
-    "TAP_PARAMETERS",
-    "Added",
-    "TapOptions",
-    "alternate_tap",
-    "pair_tap",
-    "sample_classes",
-    "shared_inputs",
-    "sum_planes",
-    "tap_options",
-]
+__all__ = ["TAP_PARAMETERS", "TapOptions", "alternate_tap", "pair_tap", "tap_options"]
 
 _TINY = 1e-6
 TAP_PARAMETERS = (
@@ -43,24 +24,16 @@ TAP_PARAMETERS = (
     "spread_slope",
     "direction_exponent",
     "area_slope",
-    "match_tolerance",
-    "match_slope",
 )
 """Parameters that the taps take as they are: sets of them share one frame."""
-
-Added = tuple[Planes, Tensor, Planes, Tensor, Tensor]
-"""Color and weight of the back, color and weight of the front, and the front's alpha."""
 
 
 class TapOptions(NamedTuple):
     """Switches of the taps; each set is compiled once."""
 
     directions: tuple[str, ...]
-    """"first", "own", "second", "reversed": those that take part, in the order of their taps."""
+    """"first", "own", "second": those that take part, in the order of their taps."""
     center: int
-    refinements: int
-    one_color: bool
-    fill_hidden: bool
     relative_depth: bool
     shares: bool
     spread: Literal["cone", "ramp"]
@@ -88,9 +61,6 @@ def tap_options(values: Values, directions: tuple[str, ...]) -> TapOptions:
     return TapOptions(
         directions=directions,
         center=Shutter(1, values.shutter_position).center,
-        refinements=values.refinements,
-        one_color=values.arrivals == "winner",
-        fill_hidden=values.hidden_times == "fill",
         relative_depth=values.depth_compare == "relative",
         shares=values.depth_classes == "shares",
         spread=values.spread,
@@ -106,30 +76,6 @@ def tap_options(values: Values, directions: tuple[str, ...]) -> TapOptions:
         softness=values.softness,
         color_lookup=values.color_lookup,
     )
-
-
-def shared_inputs(frame: Frame, texture: Tensor, pixels: PixelList, values: Values) -> Inputs:
-    """Return what the taps of all kinds look at, as lists of some pixels.
-
-    Args:
-        frame: Those pixels of the frame.
-        texture: From `texture_of`, all pixels.
-        pixels: The list.
-        values: The parameters, those per pixel as lists.
-    """
-    x, y = pixels.grid(frame.color)
-    relative = values.depth_compare == "relative"
-    inputs = {
-        "texture": texture,
-        "x": x,
-        "y": y,
-        "shift": tap_shift(frame.color, values, pixels),
-        "depth": frame.finite_depth(),
-        "extent": values.relative_depth_extent if relative else values.soft_depth_extent,
-    }
-    if values.color_lookup == "cubic":
-        inputs["texture_detail"] = second_differences(texture[:, TEXTURE_COLOR:])
-    return inputs | {key: getattr(values, key) for key in TAP_PARAMETERS}
 
 
 # -- one direction by turns ------------------------------------------------------------------------
@@ -187,11 +133,6 @@ def pair_tap(index: Tensor, count: Tensor, inputs: Inputs, options: TapOptions) 
     )
 
 
-def sum_planes(*parts: Planes) -> Planes:
-    """Return the sums of the planes that stand at one place in each part."""
-    return tuple(sum(planes[1:], planes[0]) for planes in zip(*parts, strict=True))
-
-
 # -- weights ---------------------------------------------------------------------------------------
 
 
@@ -212,21 +153,6 @@ def _sums(tap: Tap, weights: _Weights) -> Added:
     if tap.valid is not None:
         back, front = back * tap.valid, front * tap.valid
     return colors[0], back, colors[1], front, alpha
-
-
-def sample_classes(
-    pixel: Tensor, other: Tensor, inputs: Inputs, options: TapOptions
-) -> DepthWeights:
-    """Return how far a sample is in front of a pixel, and behind it."""
-    classes = depth_weights(
-        pixel,
-        other,
-        inputs["extent"],
-        relative=options.relative_depth,
-        level=inputs["depth_level"],
-        softness=options.softness,
-    )
-    return classes._replace(foreground=1 - classes.background) if options.shares else classes
 
 
 class _Line(NamedTuple):

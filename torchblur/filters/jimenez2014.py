@@ -111,7 +111,7 @@ def _filtered(frame: Frame, values: Values, engine: Engine) -> Filtered:
     own, around = tiles_of(frame, values, cull=values.neighbor_culling)
     if values.tile_encoding == "uint8":
         own, around = (quantize_uint8(tile, code_range(values)) for tile in (own, around))
-    shortest = least_spread(pixel_spread(frame, values).length, around, values)
+    shortest = least_spread(pixel_spread(frame, values).length, (around,), values)
     tiles = {"tile_max": own, "neighbor_max": around, "tile_min": shortest}
     part = moving_part(frame, values, around, stray=Stray(tile_noise(values), values.tile_jitter))
     if part is None:

@@ -76,12 +76,14 @@ class Jimenez2014Config(RevealedBackgroundConfig, ReachConfig):
     jitter: Annotated[
         float,
         Param(unit="taps", low=0.0, high=2.0, grad="weak", source=_SLIDES,
+              active_when="noise != none",
               meaning="scale of that shift; at 1 the taps of neighbors interleave"),
     ] = 1.0
     tile_jitter: Annotated[
         float,
         Param(symbol="τ", unit="tiles", low=0.0, high=2.0, grad="weak",
               source="a quarter of a tile to each side in o3de, Unity HDRP and Kino",
+              active_when="noise != none",
               meaning="how far the tile lookup may stray at the tile's edge, peak to peak"),
     ] = 0.5
     tile_classes: Annotated[
@@ -97,12 +99,14 @@ class Jimenez2014Config(RevealedBackgroundConfig, ReachConfig):
     fast_ratio: Annotated[
         float,
         Param(low=0.05, high=1.0, grad="weak", source="1/4 in Unity HDRP, 0.65 in G3D",
+              active_when="tile_classes == true",
               meaning="fast class: shortest half spread in reach over the longest, at least; low "
                       "values blur what moves otherwise in the wrong direction"),
     ] = 0.9
     neighbor_culling: Annotated[
         bool,
         Param(grad="discrete", source="Guertin 2014, section 4.4; CryENGINE 5",
+              active_when="reach == tile",
               meaning="reach: tile: a diagonal tile counts only if it can reach the middle one"),
     ] = False
     tile_encoding: Annotated[
@@ -123,6 +127,7 @@ class Jimenez2014Config(RevealedBackgroundConfig, ReachConfig):
     seed: Annotated[
         int,
         Param(low=0, high=2**31 - 1, grad="discrete", source="torchblur",
+              active_when="noise != none",
               meaning="shifts the noise (not the 2x2 dither); give each frame its own"),
     ] = 0
 # fmt: on

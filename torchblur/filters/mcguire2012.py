@@ -57,11 +57,13 @@ class McGuire2012Config(RevealedBackgroundConfig, ReconstructionConfig):
         float,
         Param(symbol="j", unit="taps", low=0.0, high=2.0, grad="weak",
               source="McGuire 2012, section 3.3",
+              active_when="noise != none",
               meaning="peak to peak amplitude of the shift of a pixel's taps"),
     ] = 1.0
     skip_middle_tap: Annotated[
         bool,
         Param(grad="discrete", source="McGuire 2012, section 3.3",
+              active_when="shutter_position == centered",
               meaning="leave out the tap nearest to the pixel, which has its own weight "
                       "(centered shutter only)"),
     ] = True

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import functools
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -216,37 +217,37 @@ def moving_pixels(frame: Frame, tiles: TileDirections, values: Values) -> PixelL
 
 
 def tile_planes(
-    color: Tensor, size: Tensor, tiles: TileDirections, pixels: PixelList, values: Values
+    color: Tensor, tiles: Sequence[Tensor], pixels: PixelList, values: Values
 ) -> list[Tensor]:
-    """Return both motions of the pixels' tiles, and the shortest half spread within reach.
+    """Return planes of tiles for pixels, all from the same tile, which noise may choose.
 
     Args:
         color: For its size, (B, 3, H, W).
-        size: Half spread of all pixels, px, (B, 1, H, W).
-        tiles: The motions.
+        tiles: The planes, (B, ·, Ty, Tx).
         pixels: Whose.
         values: The parameters.
     """
     edge = values.tile_size
     noise = noise_plane(tile_noise(values), color, 1, values.seed, pixels)
     offset = tile_offset(color, noise, edge, pixels.pack(values.tile_jitter), pixels)
-    least = least_spread(size, tiles.primary, values)
-    return [tile_lookup(t, color, edge, offset, pixels=pixels) for t in (*tiles, least)]
+    return [tile_lookup(t, color, edge, offset, pixels=pixels) for t in tiles]
 
 
-def least_spread(size: Tensor, tiles: Tensor, values: Values) -> Tensor:
+def least_spread(size: Tensor, along: Sequence[Tensor], values: Values) -> Tensor:
     """Return the shortest half spread that the taps of each tile may meet, px, (B, 1, Ty, Tx).
 
     Args:
         size: Half spread of all pixels, px, (B, 1, H, W).
-        tiles: Along what taps lie, px, (B, 2, Ty, Tx).
+        along: Half spreads of the tiles along which taps lie, px, (B, 2, Ty, Tx) each.
         values: `reach`, `tile_size`, the shutter's position.
     """
     edge = values.tile_size
     least = tile_min(size.detach(), edge)
     if values.reach == "tile":
         return neighbor_min(least)
-    return least_along(least, tiles, edge, longest_spread(values), swept_times(values))
+    longest, times = longest_spread(values), swept_times(values)
+    found = (least_along(least, tiles, edge, longest, times) for tiles in along)
+    return functools.reduce(torch.minimum, found)
 
 
 def _farthest(neighborhood: Tensor, values: Values) -> float:

@@ -10,16 +10,16 @@ from torch import Tensor
 
 from torchblur.configured import batch_size_of
 from torchblur.filters.base import Values
-from torchblur.filters.moving import moving_among, moving_pixels, packed_values, tile_planes
-from torchblur.filters.notes2025_config import Notes2025Config
-from torchblur.filters.notes2025_gather import (
-    SHARED_PARAMETERS,
-    Blurred,
-    Line,
-    compose,
-    gather_line,
-    shared_inputs,
+from torchblur.filters.front_back import Blurred, compose
+from torchblur.filters.moving import (
+    least_spread,
+    moving_among,
+    moving_pixels,
+    packed_values,
+    tile_planes,
 )
+from torchblur.filters.notes2025_config import Notes2025Config
+from torchblur.filters.notes2025_gather import SHARED_PARAMETERS, Line, gather_line, shared_inputs
 from torchblur.filters.notes2025_postfilter import post_filter
 from torchblur.filters.places import num_pairs
 from torchblur.filters.reach import ReachingBlur, code_range, longest_spread, tap_counts
@@ -126,11 +126,12 @@ def _layers(frame: Frame, values: Values, engine: Engine) -> dict[str, Tensor]:
 def _moving(
     frame: Frame, spread: Spread, tiles: TileDirections, values: Values
 ) -> tuple[PixelList, list[Tensor]]:
-    """Return the pixels whose tile moves, and their `tile_planes`."""
+    """Return the pixels whose tile moves; both motions and the `least_spread` of the tile."""
     pixels = moving_pixels(frame, tiles, values)
     if pixels.count == 0:
         return pixels, []
-    planes = tile_planes(frame.color, spread.length, tiles, pixels, values)
+    least = least_spread(spread.length, tiles, values)
+    planes = tile_planes(frame.color, (*tiles, least), pixels, values)
     chosen = moving_among(planes[0], pixels.pack(values.early_out))
     if chosen is None:
         return pixels, planes

@@ -47,10 +47,12 @@ class Notes2025Config(RevealedBackgroundConfig, ReachConfig):
     )] = "checkerboard"
     jitter: Annotated[float, Param(
         unit="taps", low=0.0, high=2.0, grad="weak", source=_BASE,
+        active_when="noise != none",
         meaning="scale of that shift; at 1 the taps of neighbors interleave",
     )] = 1.0
     tile_jitter: Annotated[float, Param(
         unit="tiles", low=0.0, high=2.0, grad="weak", source=f"{_SECOND} (tried and left out)",
+        active_when="noise != none",
         meaning="how far the tile lookup may stray at the tile's edge, peak to peak",
     )] = 0.0
     early_out: Annotated[float, Param(
@@ -76,10 +78,12 @@ class Notes2025Config(RevealedBackgroundConfig, ReachConfig):
     depth_range: Annotated[float, Param(
         unit="scene units", low=1e-4, high=1e4, scale="log", grad="smooth",
         source=f"{_SECOND} (1 / g_depthMaxDeltaRcp, {_UNSTATED})",
+        active_when="depth_compare == absolute",
         meaning="depth difference that tells front from back",
     )] = 1.0
     relative_depth_range: Annotated[float, Param(
         low=1e-3, high=10.0, scale="log", grad="smooth", source="torchblur",
+        active_when="depth_compare == relative",
         meaning='the same for depth_compare="relative", as a fraction of the nearer depth',
     )] = 0.1
     depth_compare: Annotated[Literal["absolute", "relative"], Param(
@@ -95,6 +99,7 @@ class Notes2025Config(RevealedBackgroundConfig, ReachConfig):
     )] = 0.0
     seed: Annotated[int, Param(
         low=0, high=2**31 - 1, grad="discrete", source="torchblur",
+        active_when="noise != none",
         meaning="shifts the noise (not the 2x2 dither); give each frame its own",
     )] = 0
 
@@ -105,10 +110,12 @@ class Notes2025Config(RevealedBackgroundConfig, ReachConfig):
     )] = True
     center_weight: Annotated[float, Param(
         low=0.0, high=1.0, grad="smooth", source="0 in the notes; above it as in Blender's EEVEE",
+        active_when="separate_sums == true",
         meaning="weight of the pixel's own color in the background, in taps",
     )] = 0.0
     background_fade: Annotated[float, Param(
         low=0.0, high=1.0, grad="discrete", source=f"0: {_HALF}",
+        active_when="separate_sums == true",
         meaning="share of the taps up to which a blurred background fades in; 0 is all or nothing",
     )] = 0.0
 
@@ -119,18 +126,22 @@ class Notes2025Config(RevealedBackgroundConfig, ReachConfig):
     )] = "two"
     direction_reduction: Annotated[DirectionReduction, Param(
         grad="discrete", source=f"hierarchical: {_SECOND}; exact: torchblur",
+        active_when="directions == two and reach == tile",
         meaning="reach: tile: second direction from all pixels, or from cells, tiles, 3x3 tiles",
     )] = "exact"
     secondary_exponent: Annotated[float, Param(
         low=0.25, high=8.0, scale="log", grad="weak", source=_SECOND,
+        active_when="directions == two",
         meaning="how much the angle counts against the length in the second direction",
     )] = 2.0
     neighbor_culling: Annotated[bool, Param(
         grad="discrete", source="Guertin 2014, section 4.4",
+        active_when="reach == tile",
         meaning="reach: tile: a diagonal tile counts only if it can reach the middle one",
     )] = False
     min_angle: Annotated[float, Param(
         unit="degrees", low=0.0, high=90.0, grad="weak", source=_SECOND,
+        active_when="directions == two",
         meaning="the second direction is skipped where the two are closer than this",
     )] = 5.0
     depth_level: Annotated[float, Param(
@@ -143,6 +154,7 @@ class Notes2025Config(RevealedBackgroundConfig, ReachConfig):
     )] = True
     direction_exponent: Annotated[float, Param(
         low=0.1, high=16.0, scale="log", grad="smooth", source=_SECOND,
+        active_when="direction_weights == true",
         meaning="exponent of the direction weights",
     )] = 3.0
     tile_classes: Annotated[bool, Param(
@@ -151,10 +163,12 @@ class Notes2025Config(RevealedBackgroundConfig, ReachConfig):
     )] = False
     fast_ratio: Annotated[float, Param(
         low=0.05, high=1.0, grad="weak", source="1/4 in Unity HDRP, 0.65 in G3D",
+        active_when="tile_classes == true",
         meaning="tile_classes: shortest half spread in reach over the longest, at least",
     )] = 0.9
     alpha_combination: Annotated[Literal["max", "mean"], Param(
         grad="discrete", source=f"max: {_SECOND}; mean: torchblur, for comparison",
+        active_when="directions == two",
         meaning="alpha of the two directions together",
     )] = "max"
 
@@ -165,6 +179,7 @@ class Notes2025Config(RevealedBackgroundConfig, ReachConfig):
     )] = True
     area_slope: Annotated[float, Param(
         unit="1/px", low=0.1, high=16.0, scale="log", grad="smooth", source=_ALPHA,
+        active_when="accurate_alpha == true",
         meaning="a sample of half spread V covers 1 + area_slope * V px",
     )] = 2.0
     alpha_gain: Annotated[float, Param(
@@ -178,38 +193,47 @@ class Notes2025Config(RevealedBackgroundConfig, ReachConfig):
     )] = True
     post_samples: Annotated[int, Param(
         unit="taps", low=1, high=64, scale="log", grad="discrete", source=_POST,
+        active_when="post_filter == true",
         meaning="most taps of the post-filter per direction, both sides",
     )] = 6
     post_radius: Annotated[float, Param(
         low=0.05, high=2.0, grad="weak", source=_POST,
+        active_when="post_filter == true",
         meaning="radius of the post-filter over the gap between two taps",
     )] = 0.5
     post_alpha: Annotated[Literal["foreground", "output"], Param(
         grad="discrete", source=f"foreground: {_POST}; output: {_HALF}",
+        active_when="post_filter == true",
         meaning="alpha that the post-filter compares: the foreground's, or 1 where there is blur",
     )] = "foreground"
     post_acceptance: Annotated[Literal["hard", "soft"], Param(
         grad="discrete", source=f"hard: {_POST}; soft: torchblur",
+        active_when="post_filter == true",
         meaning="threshold on the difference of alphas, or a bell that has gradients",
     )] = "hard"
     post_threshold: Annotated[float, Param(
         low=0.05, high=4.0, grad="weak", source=_POST,
+        active_when="post_acceptance == hard",
         meaning="threshold on the difference of alphas, in steps of one tap per side (hard)",
     )] = 1.0
     post_tau: Annotated[float, Param(
         low=0.05, high=4.0, grad="smooth", source="torchblur",
+        active_when="post_acceptance == soft",
         meaning="width of the bell over the difference of alphas, in the same steps (soft)",
     )] = 1.0
     post_zero_alpha: Annotated[float, Param(
         low=1e-6, high=0.5, grad="weak", source=f"0: {_POST}",
+        active_when="post_filter == true",
         meaning="alpha up to which a pixel counts as neither moving nor blurred over",
     )] = 1e-4
     post_edges: Annotated[bool, Param(
         grad="discrete", source=_POST,
+        active_when="post_filter == true",
         meaning="at the outer edge of a blur take samples without alpha, too",
     )] = True
     post_center_weight: Annotated[float, Param(
         low=0.01, high=8.0, scale="log", grad="smooth", source=f"torchblur ({_UNSTATED})",
+        active_when="post_filter == true",
         meaning="weight of the pixel itself in the post-filter, in taps",
     )] = 1.0
 
@@ -234,38 +258,48 @@ class Notes2025Config(RevealedBackgroundConfig, ReachConfig):
     downsample_depth_range: Annotated[float, Param(
         unit="scene units", low=1e-4, high=1e4, scale="log", grad="smooth",
         source=f"{_HALF} (g_downsampleDepthRange, {_UNSTATED})",
+        active_when="resolution == half",
         meaning="distance to the nearest of 2x2 pixels at which motion and depth do not count",
     )] = 1.0
     upsample_depth_range: Annotated[float, Param(
         unit="scene units", low=1e-4, high=1e4, scale="log", grad="smooth",
         source=f"{_HALF} (g_upsampleDepthRange, {_UNSTATED})",
+        active_when="upsample_depth_weights == true",
         meaning="distance behind a pixel at which a half-resolution sample does not count",
     )] = 1.0
     upsample_depth_weights: Annotated[bool, Param(
         grad="discrete", source=_HALF,
+        active_when="resolution == half",
         meaning="weight alphas by depth, so that no background blurs over a sharp foreground",
     )] = True
     alpha_weighted_color: Annotated[bool, Param(
         grad="discrete", source=_HALF,
+        active_when="resolution == half",
         meaning="weight colors by alpha, so that no sharp foreground leaks into the background",
     )] = True
     corner_fallback: Annotated[bool, Param(
         grad="discrete", source=_HALF,
+        active_when="upsample_depth_weights == true",
         meaning="leave the depth weights out where they leave nothing",
     )] = True
     alpha_fade: Annotated[bool, Param(
         grad="discrete", source=_HALF,
+        active_when="resolution == half",
         meaning="fade to full resolution where motion is shorter than a half-resolution pixel",
     )] = True
     fade_start: Annotated[float, Param(
         unit="px", low=0.0, high=1.5, grad="smooth", source=_HALF,
+        active_when="alpha_fade == true",
         meaning="half spread up to which the alpha is fade_min_alpha (full-resolution px)",
     )] = 1.0
     fade_end: Annotated[float, Param(
         unit="px", low=1.6, high=16.0, grad="smooth", source=_HALF,
+        active_when="alpha_fade == true",
         meaning="half spread from which the alpha is left as it is (full-resolution px)",
     )] = 2.0
     fade_min_alpha: Annotated[float, Param(
-        low=0.0, high=1.0, grad="smooth", source=_HALF, meaning="factor of the faded alpha",
+        low=0.0, high=1.0, grad="smooth", source=_HALF,
+        active_when="alpha_fade == true",
+        meaning="factor of the faded alpha",
     )] = 0.5
 # fmt: on

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -10,6 +9,7 @@ import torch
 from torch import Tensor
 
 from torchblur.filters.base import Values
+from torchblur.filters.front_back import Sums
 from torchblur.filters.places import SHORTEST_REACH, num_pairs, tap_shift
 from torchblur.filters.reach import by_length
 from torchblur.filters.reconstruction import ColorLookup, Tap, sample, texture_of
@@ -21,15 +21,7 @@ from torchblur.ops.spread import Mirror, SpreadForm, TapPair, depth_shares, mirr
 from torchblur.ops.velocity import direction, length
 from torchblur.ops.weights import power, saturate
 
-__all__ = [
-    "SHARED_PARAMETERS",
-    "Blurred",
-    "Line",
-    "Sums",
-    "compose",
-    "gather_line",
-    "shared_inputs",
-]
+__all__ = ["SHARED_PARAMETERS", "Line", "gather_line", "shared_inputs"]
 
 SHARED_PARAMETERS = (
     "depth_range",
@@ -44,7 +36,6 @@ SHARED_PARAMETERS = (
 )
 """Parameters of the taps and of their sums: sets of them share one frame."""
 
-_LEAST_SUM = 1e-30  # of weights: the gradient of a division by less is not finite
 _PARAMETERS = ("depth_level", "spread_offset", "spread_slope", "direction_exponent", "area_slope")
 
 
@@ -65,37 +56,6 @@ class Line(NamedTuple):
     def image(self, pixels: PixelList) -> Line:
         """Return images of the lists, 0 elsewhere; the pairs stay as they are."""
         return self._replace(vector=pixels.unpack(self.vector), used=pixels.unpack(self.used))
-
-
-class Sums(NamedTuple):
-    """Means over the taps of one line (the colors by their weights; the last a maximum)."""
-
-    background_color: Tensor
-    background: Tensor
-    foreground_color: Tensor
-    foreground: Tensor
-    alpha: Tensor
-    """Foreground's alpha in [0, 1], (B, 1, H, W)."""
-    influence: Tensor
-    """Longest half spread of the taps with a weight, px, (B, 1, H, W)."""
-
-
-class Blurred(NamedTuple):
-    """What the main pass leaves: images or lists."""
-
-    color: Tensor
-    alpha: Tensor
-    """Foreground's alpha, (B, 1, H, W)."""
-    output_alpha: Tensor
-    """How much of the color must replace the sharp one: 1 over a blurred background."""
-    weight: Tensor
-    """Mean weight of the taps, in [0, 1], (B, 1, H, W)."""
-    influence: Tensor
-
-    def images(self, frame: Frame, pixels: PixelList) -> Blurred:
-        """Return images of the lists: all other pixels have their own color, and 0."""
-        color, *planes = self
-        return Blurred(pixels.unpack(color, over=frame.color), *(pixels.unpack(p) for p in planes))
 
 
 class _Options(NamedTuple):
@@ -317,76 +277,3 @@ def _spread(distance: Tensor, size: Tensor, inputs: Inputs, options: _Options) -
         form=options.spread_form,
         softness=options.softness,
     )
-
-
-# -- the sums' color -------------------------------------------------------------------------------
-
-
-def compose(frame: Frame, lines: list[Sums], moving: Tensor, values: Values) -> Blurred:
-    """Return the color of the main pass from the sums along one or two lines.
-
-    Args:
-        frame: The frame, for its color; all may be lists.
-        lines: Sums along the first and, if there is one, the second direction.
-        moving: Where the tile moves; elsewhere the color stays, bool, (B, 1, H, W).
-        values: The parameters.
-    """
-    total = Sums(*(sum(planes[1:], planes[0]) for planes in zip(*lines, strict=True)))
-    influence = functools.reduce(torch.maximum, (sums.influence for sums in lines))
-    weights = (sums.background + sums.foreground for sums in lines)
-    weight = functools.reduce(torch.maximum, weights)
-    if values.separate_sums:
-        alpha = _together([sums.alpha for sums in lines], values)
-        color, alpha, output = _separate(frame, total, alpha, values)
-    else:
-        alpha = _together([sums.background + sums.foreground for sums in lines], values)
-        color, alpha, output = _combined(frame, total, alpha)
-    color = torch.where(moving, color, frame.color)
-    planes = (torch.where(moving, p, 0.0) for p in (alpha, output, weight, influence))
-    return Blurred(color, *planes)
-
-
-def _together(alphas: list[Tensor], values: Values) -> Tensor:
-    stacked = torch.stack(alphas)
-    return stacked.amax(0) if values.alpha_combination == "max" else stacked.mean(0)
-
-
-def _separate(
-    frame: Frame, total: Sums, alpha: Tensor, values: Values
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Return color, alpha and output alpha: foreground over background.
-
-    With v for a valid background the whole is ``α fg + (1 − α) (v bg + (1 − v) sharp)``; what
-    is not the sharp color leaves here, with its share ``α + v − α v``.
-    """
-    has_foreground = total.foreground > _LEAST_SUM
-    foreground = total.foreground_color / torch.where(has_foreground, total.foreground, 1.0)
-    alpha = torch.where(has_foreground, alpha, 0.0)
-    center = values.center_weight / (2 * num_pairs(values))
-    if frame.valid is not None:
-        center = center * frame.valid.to(frame.dtype)
-    weight = total.background + center
-    background = total.background_color + center * frame.color
-    background = background / torch.where(weight > _LEAST_SUM, weight, 1.0)
-    blurred = (total.background > _LEAST_SUM).to(frame.dtype)
-    if values.background_fade > 0:
-        blurred = saturate(total.background / values.background_fade, values.softness)
-    output = alpha + blurred * (1 - alpha)
-    color = alpha * foreground + (1 - alpha) * blurred * background
-    if values.resolution == "full":
-        return color + (1 - output) * frame.color, alpha, output
-    own = output > 0
-    return torch.where(own, color / torch.where(own, output, 1.0), frame.color), alpha, output
-
-
-def _combined(frame: Frame, total: Sums, alpha: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Return the same from one sum, over the pixel's own color."""
-    weight = total.background + total.foreground
-    some = weight > _LEAST_SUM
-    blurred = (total.background_color + total.foreground_color) / torch.where(some, weight, 1.0)
-    alpha = torch.where(some, alpha, 0.0)
-    share = alpha
-    if frame.valid is not None:  # an invalid pixel has no color of its own
-        share = torch.where(frame.valid | ~some, alpha, 1.0)
-    color = share * blurred + (1 - share) * frame.color
-    return color, alpha, alpha

@@ -8,8 +8,10 @@ import torch
 from torch import Tensor
 
 from torchblur.filters.base import Values
-from torchblur.filters.notes2025_gather import Blurred, Line
+from torchblur.filters.front_back import Blurred
+from torchblur.filters.notes2025_gather import Line
 from torchblur.filters.places import num_pairs
+from torchblur.filters.reach import tap_counts
 from torchblur.frame import Frame
 from torchblur.ops.gather import (
     Engine,
@@ -60,7 +62,7 @@ def post_filter(
         radius (the text starts at an unsaid place), and the pixel itself has a weight, so that
         the weights are never all zero.
     """
-    inputs = _inputs(frame, image, values)
+    inputs = _inputs(frame, image, lines[0], values)
     options = _Options(values.post_acceptance == "soft")
     along = [_along(line, inputs, options, values, engine) for line in lines]
     sums = [sum(planes[1:], planes[0]) for planes in zip(*along, strict=True)]
@@ -79,22 +81,27 @@ def post_filter(
     )
 
 
-def _inputs(frame: Frame, image: Blurred, values: Values) -> Inputs:
+def _inputs(frame: Frame, image: Blurred, first: Line, values: Values) -> Inputs:
     x, y = pixel_grid(frame.color)
     alpha = image.alpha if values.post_alpha == "foreground" else image.output_alpha
     usable = torch.ones_like(alpha)
     if frame.valid is not None:
         usable = (frame.valid | (image.weight > 0)).to(frame.dtype)
-    step = 1 / num_pairs(values)
+    pairs = _pairs(first, values)
     return {
         "texture": torch.cat(_alike(image.color, alpha, image.output_alpha, usable), 1),
         "x": x,
         "y": y,
         "alpha": alpha,
-        "threshold": values.post_threshold * step,
-        "tau": values.post_tau * step,
+        "threshold": values.post_threshold / pairs,
+        "tau": values.post_tau / pairs,
         "zero": values.post_zero_alpha,
     }
+
+
+def _pairs(line: Line, values: Values) -> Tensor:
+    """Return how many pairs of taps lie along a line, those that are doubled counted once."""
+    return tap_counts(values, length(line.vector), num_pairs(values))
 
 
 def _alike(*planes: Tensor) -> Planes:
@@ -107,7 +114,7 @@ def _along(
     line: Line, shared: Inputs, options: _Options, values: Values, engine: Engine
 ) -> tuple[Tensor, ...]:
     """Return color and weight of the samples along a line, inside and at an edge, and the peak."""
-    gap = length(line.vector) / num_pairs(values)
+    gap = length(line.vector) / _pairs(line, values)
     most = max(values.post_samples // 2, 1)
     inputs = shared | {
         **components("unit", direction(line.vector)),

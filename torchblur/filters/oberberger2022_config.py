@@ -67,6 +67,7 @@ class Oberberger2022Config(FilterConfig):
     )] = "variance"
     blend_gain: Annotated[float, Param(
         low=0.1, high=10.0, scale="log", grad="smooth", source=_unstated(_VARIANCE),
+        active_when="blend_source == variance",
         meaning='gain of that share before it is clamped (blend_source="variance")',
     )] = 1.0
 
@@ -77,18 +78,22 @@ class Oberberger2022Config(FilterConfig):
     )] = True
     prefilter_samples: Annotated[int, Param(
         unit="samples", low=1, high=16, grad="discrete", source=_PREFILTER,
+        active_when="prefilter == true",
         meaning="random samples per pixel; all of a 3x3 neighborhood are shared",
     )] = 2
     prefilter_jitter: Annotated[float, Param(
         unit="px", low=0.0, high=8.0, grad="weak", source=_PREFILTER,
+        active_when="prefilter == true",
         meaning="how far a random sample may stray from the line, in x and in y",
     )] = 1.5
     prefilter_distance: Annotated[float, Param(
         unit="px", low=0.1, high=16.0, scale="log", grad="weak", source=_PREFILTER,
+        active_when="prefilter == true",
         meaning="a sample is taken if its path comes nearer to the pixel than this",
     )] = 2.5
     prefilter_min_length: Annotated[float, Param(
         unit="px", low=0.1, high=64.0, scale="log", grad="weak", source=_PREFILTER,
+        active_when="prefilter == true",
         meaning="pixels that move less than this are left as they are",
     )] = 3.0
 
@@ -124,18 +129,22 @@ class Oberberger2022Config(FilterConfig):
     )] = True
     reprojection_iterations: Annotated[int, Param(
         low=1, high=16, grad="discrete", source=_TEMPORAL,
+        active_when="temporal == true",
         meaning="how often a place in the last frame is tried and moved",
     )] = 2
     accept_threshold: Annotated[float, Param(
         unit="px", low=0.05, high=16.0, scale="log", grad="weak", source=_unstated(_TEMPORAL),
+        active_when="temporal == true",
         meaning="a place is good if projecting back and forth misses by less than this",
     )] = 1.0
     cancel_threshold: Annotated[float, Param(
         unit="px", low=1.0, high=128.0, scale="log", grad="weak", source=_unstated(_TEMPORAL),
+        active_when="temporal == true",
         meaning="the search ends if it misses by more than this (and by more than the motion)",
     )] = 16.0
     history_limit: Annotated[float, Param(
         low=0.01, high=64.0, scale="log", grad="smooth", source=f"{_OURS} (unbounded in the paper)",
+        active_when="temporal == true",
         meaning="largest weight that is kept for the next frame; 1 is one frame's samples",
     )] = 8.0
 
@@ -146,22 +155,27 @@ class Oberberger2022Config(FilterConfig):
     )] = 3
     kernel_scaling: Annotated[Literal["motion", "fixed"], Param(
         grad="discrete", source=f"motion: {_SPATIAL}; fixed: Dammertz 2010",
+        active_when="second_stage_iterations > 0",
         meaning="steps of the kernel follow the motion, or are 1, 2, 4 … px",
     )] = "motion"
     kernel_rotation: Annotated[bool, Param(
         grad="discrete", source=_SPATIAL,
+        active_when="kernel_scaling == motion",
         meaning='turn the kernel to the mean motion (kernel_scaling="motion")',
     )] = True
     step_divisor: Annotated[float, Param(
         low=1.0, high=20.0, scale="log", grad="weak", source=_SPATIAL,
+        active_when="kernel_scaling == motion",
         meaning="steps of the last pass are the mean length over this",
     )] = 5.0
     min_step: Annotated[float, Param(
         unit="px", low=0.0, high=4.0, grad="weak", source=f"0: {_SPATIAL}; 1: {_OURS}",
+        active_when="kernel_scaling == motion",
         meaning="least step along the motion; below 1/2 all taps may fall on the pixel itself",
     )] = 1.0
     lookup: Annotated[Lookup, Param(
         grad="discrete", source=f"nearest: {_SPATIAL}; bilinear: {_OURS}",
+        active_when="second_stage_iterations > 0",
         meaning="round the taps of the second stage to whole pixels, or interpolate",
     )] = "nearest"
 
@@ -172,10 +186,12 @@ class Oberberger2022Config(FilterConfig):
     )] = False
     albedo_floor: Annotated[float, Param(
         low=1e-4, high=0.5, scale="log", grad="smooth", source=_OURS,
+        active_when="demodulate == true",
         meaning="least albedo that the color is divided by (demodulate)",
     )] = 0.01
     seed: Annotated[int, Param(
         low=0, high=2**31 - 1, grad="discrete", source=_OURS,
+        active_when="prefilter == true",
         meaning="random samples of the pre-filter; each frame of a sequence gets others by itself",
     )] = 0
 # fmt: on

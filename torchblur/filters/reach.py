@@ -66,6 +66,7 @@ class ReachConfig(FilterConfig):
     )] = "tile"
     max_reach: Annotated[float, Param(
         unit="px", low=1.0, high=4096.0, scale="log", grad="discrete", source="torchblur",
+        active_when="reach == frame",
         meaning="reach: frame: longest half spread that is blurred; what is longer is cut. Vectors "
                 "in 8 bits have steps of max_reach / 127",
     )] = 512.0
@@ -75,8 +76,10 @@ class ReachConfig(FilterConfig):
     )] = 0.0
     max_samples: Annotated[int, Param(
         unit="taps", low=1, high=1024, scale="log", grad="discrete", source="torchblur",
-        meaning="tap_spacing: most taps of a path",
-    )] = 128
+        active_when="tap_spacing > 0",
+        meaning="tap_spacing: most taps of a path; longer ones than max_samples * tap_spacing have "
+                "them farther apart",
+    )] = 512
 # fmt: on
 
 

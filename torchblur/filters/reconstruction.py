@@ -22,6 +22,7 @@ __all__ = [
     "TEXTURE_COLOR",
     "WEIGHT_PARAMETERS",
     "ColorLookup",
+    "GatherConfig",
     "ReconstructionConfig",
     "Tap",
     "color_from",
@@ -39,8 +40,8 @@ TEXTURE_COLOR = 4
 _WEIGHTS = "McGuire 2012, section 3.3 (restated by Tan 2022, appendix, eq. 5-10)"
 
 
-class ReconstructionConfig(ReachConfig):
-    """Constants of the cone, cylinder and depth weights, and of the lookups."""
+class GatherConfig(ReachConfig):
+    """Taps, tiles and lookups of a gather."""
 
     num_samples: Annotated[
         int,
@@ -68,6 +69,59 @@ class ReconstructionConfig(ReachConfig):
             meaning=TILE_MEANING,
         ),
     ] = 20
+    early_out: Annotated[
+        float,
+        Param(
+            unit="px",
+            low=0.0,
+            high=4.0,
+            grad="weak",
+            source="McGuire 2012, section 3.3",
+            meaning="a pixel is left as it is where the tile's half spread is not above this",
+        ),
+    ] = 0.505
+    softness: Annotated[
+        float,
+        Param(
+            low=0.0,
+            high=0.5,
+            grad="discrete",
+            source="torchblur",
+            meaning="rounds the corners of the clamped weights, so that gradients pass them",
+        ),
+    ] = 0.0
+    color_lookup: Annotated[
+        Lookup,
+        Param(
+            grad="discrete",
+            source="McGuire 2012",
+            meaning="lookup of the color; velocity and depth are always nearest",
+        ),
+    ] = "nearest"
+    noise: Annotated[
+        NoiseKind,
+        Param(
+            grad="discrete",
+            source="Guertin 2014, section 4.5; Jimenez 2014",
+            meaning="jitter per pixel: Halton points, interleaved gradient noise, or none",
+        ),
+    ] = "halton"
+    seed: Annotated[
+        int,
+        Param(
+            low=0,
+            high=2**31 - 1,
+            grad="discrete",
+            source="torchblur",
+            active_when="noise != none",
+            meaning="shifts the noise; give each frame of a sequence its own",
+        ),
+    ] = 0
+
+
+class ReconstructionConfig(GatherConfig):
+    """Constants of the cone, cylinder and depth weights."""
+
     cone_slope: Annotated[
         float,
         Param(
@@ -162,53 +216,6 @@ class ReconstructionConfig(ReachConfig):
             meaning="shortest half spread that the weights divide by",
         ),
     ] = 0.5
-    early_out: Annotated[
-        float,
-        Param(
-            unit="px",
-            low=0.0,
-            high=4.0,
-            grad="weak",
-            source="McGuire 2012, section 3.3",
-            meaning="a pixel is left as it is where the tile's half spread is not above this",
-        ),
-    ] = 0.505
-    softness: Annotated[
-        float,
-        Param(
-            low=0.0,
-            high=0.5,
-            grad="discrete",
-            source="torchblur",
-            meaning="rounds the corners of the clamped weights, so that gradients pass them",
-        ),
-    ] = 0.0
-    color_lookup: Annotated[
-        Lookup,
-        Param(
-            grad="discrete",
-            source="McGuire 2012",
-            meaning="lookup of the color; velocity and depth are always nearest",
-        ),
-    ] = "nearest"
-    noise: Annotated[
-        NoiseKind,
-        Param(
-            grad="discrete",
-            source="Guertin 2014, section 4.5; Jimenez 2014",
-            meaning="jitter per pixel: Halton points, interleaved gradient noise, or none",
-        ),
-    ] = "halton"
-    seed: Annotated[
-        int,
-        Param(
-            low=0,
-            high=2**31 - 1,
-            grad="discrete",
-            source="torchblur",
-            meaning="shifts the noise; give each frame of a sequence its own",
-        ),
-    ] = 0
 
 
 def color_from(frame: Frame, spread: Spread) -> int:

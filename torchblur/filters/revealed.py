@@ -44,6 +44,7 @@ class RevealedBackgroundConfig(FilterConfig):
     background_depth: Annotated[
         float,
         Param(low=0.01, high=2.0, scale="log", grad="smooth", source="torchblur",
+              active_when="background == revealed",
               meaning="share of the way from the pixel to the revealed layer behind it, in "
                       "1 / depth, from which a tap shows the background"),
     ] = 1.0

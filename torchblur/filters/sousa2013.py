@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from torchblur.filters.base import Values
-from torchblur.filters.reach import ReachingBlur, by_length, longest_spread
+from torchblur.filters.reach import ReachingBlur, by_length, longest_spread, tap_counts
 from torchblur.filters.reconstruction import (
     WEIGHT_PARAMETERS,
     ReconstructionConfig,
@@ -68,6 +68,7 @@ class Sousa2013Config(ReconstructionConfig):
     pass_spread: Annotated[
         float,
         Param(low=0.0, high=4.0, grad="weak", source="1 closes the gaps (torchblur)",
+              active_when="passes > 1",
               meaning="half spread of a further pass, times N over that of the pass before"),
     ] = 1.0
     cylinder_outer: Annotated[
@@ -94,6 +95,7 @@ class Sousa2013Config(ReconstructionConfig):
         float,
         Param(symbol="j", unit="taps", low=0.0, high=2.0, grad="weak",
               source="McGuire 2012, section 3.3",
+              active_when="noise != none",
               meaning="peak to peak amplitude of the shift of a pixel's taps"),
     ] = 1.0
     encoding: Annotated[
@@ -105,6 +107,7 @@ class Sousa2013Config(ReconstructionConfig):
         float,
         Param(unit="scene units", low=0.01, high=1e5, scale="log", grad="weak",
               source="torchblur; the slides do not say",
+              active_when="encoding == packed",
               meaning="depth that the greatest of the 256 packed depths stands for"),
     ] = 100.0
 # fmt: on
@@ -179,7 +182,8 @@ def _layers(frame: Frame, values: Values, engine: Engine) -> dict[str, Tensor]:
         layers.setdefault("first_pass", color)
         layers.setdefault("weight", weight)
         frame = frame.replaced(color=color)
-        scale, center = scale * values.pass_spread / values.num_samples, 0
+        taps = tap_counts(values, length(dominant), values.num_samples)
+        scale, center = scale * values.pass_spread / taps, 0
     return layers | {"color": color}
 
 

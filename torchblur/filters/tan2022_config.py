@@ -42,6 +42,7 @@ class Tan2022Config(ReconstructionConfig):
     jitter: Annotated[float, Param(
         symbol="j", unit="taps", low=0.0, high=1.0, grad="weak",
         source=f"McGuire 2012, section 3.3 ({_UNSTATED})",
+        active_when="noise != none",
         meaning="peak to peak amplitude of the shift of a pixel's taps",
     )] = 1.0
     foreground_magnifier: Annotated[float, Param(

@@ -8,7 +8,7 @@ from typing import Any
 from torch import Tensor, nn
 
 from torchblur.errors import ConfigError
-from torchblur.filters.base import BlurFilter, TemporalBlur
+from torchblur.filters.base import BlurFilter, TemporalBlur, with_shutter
 from torchblur.frame import Frame
 from torchblur.params import Param, declared
 
@@ -84,6 +84,7 @@ class TwoPassBlur(nn.Module):
             "color" after both passes and "first_pass" after one, (B, 3, H, W), and what else the
             inner filter adds in its first pass.
         """
+        overrides = with_shutter(overrides)
         first = self.blur.layers(frame, **overrides)
         color = first["color"]
         again = dataclasses.replace(frame.expand(color.shape[0]), color=color)

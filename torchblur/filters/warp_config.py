@@ -71,10 +71,12 @@ class WarpConfig(FilterConfig):
     )] = "guessed"
     background_reach: Annotated[int, Param(
         unit="px", low=1, high=512, scale="log", grad="discrete", source=_OURS,
+        active_when="background == guessed",
         meaning="how far behind an edge the background is guessed, at most",
     )] = 64
     edge_radius: Annotated[int, Param(
         unit="px", low=0, high=4, grad="discrete", source=_TUNED,
+        active_when="background == guessed",
         meaning="how far from an edge, whose pixels mix colors, the guess takes its color",
     )] = 2
     own_weight: Annotated[float, Param(

@@ -1,4 +1,4 @@
-"""Consecutive frames of one folder as a `Sequence`, with one error for whatever does not fit."""
+"""Consecutive frames as a `FrameSequence`, with one error for whatever does not fit."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from torchblur.errors import FileFormatError
-from torchblur.frame import Frame, Sequence
+from torchblur.frame import Frame, FrameSequence
 from torchblur.io.frames import read_frame
 from torchblur.io.sequences import FrameFiles, find_frames
 
@@ -18,26 +18,26 @@ _ROUNDING = 1e-5  # how far beyond [0, 1] a time may be rounded
 
 
 def read_sequence(
-    place: str | Path,
+    place: str | Path | Iterable[str | Path],
     *,
     name: str = "stream",
     cuts: Iterable[int] = (),
     numbers: tuple[int, int] | None = None,
-    needs: Iterable[str] = ("time",),
+    needs: Iterable[str] | None = None,
     **options: Any,
-) -> Sequence:
+) -> FrameSequence:
     """Read consecutive frames in the order of their numbers.
 
     Args:
-        place: A folder with files `NAME.####.exr`, or a pattern with #### (then `name` is not
-            used).
-        name: Which of a folder's files: "stream", one of several samples per pixel ("stream01"),
-            "center", or the name of another sequence.
+        place: A folder with files `NAME.####.exr`, a pattern with #### ("shots/sharp.####.exr"),
+            or files in their order, whose numbers may have gaps.
+        name: Which of a folder's files, if `place` is one: "stream", one of several samples per
+            pixel ("stream01"), "center", or the name of another sequence.
         cuts: Positions in the sequence of the frames that begin a new shot, from 0, as in
-            `Sequence`.
+            `FrameSequence`.
         numbers: First and last frame number to be read; all if left out.
         needs: Layers beside color and velocity that every frame must have, such as a filter's
-            `needs`; ``()`` for frames that are no stream.
+            `needs`. Left out, that is "time" for files named stream, and none for others.
         **options: As for `read_frame`: convention, layer, view, and overrides.
 
     Returns:
@@ -49,14 +49,16 @@ def read_sequence(
         FrameError: bad values, as `read_frame`; a cut outside the sequence.
         ConfigError: unknown convention or override.
     """
-    place = Path(place)
-    files = find_frames(place / f"{name}.####.exr" if place.is_dir() else place)
-    files = _between(files, numbers, place)
-    _check_numbers(files)
+    files = _between(_files(place, name), numbers, place)
+    if isinstance(place, str | Path):
+        _check_numbers(files)
+    if needs is None:
+        needs = ("time",) if files[0].path.name.startswith("stream") else ()
+    needs = tuple(needs)
     frames: list[Frame] = []
     for each in files:
         frame = read_frame(each, **options)
-        _check_layers(frame, each.path, tuple(needs))
+        _check_layers(frame, each.path, needs)
         if frames and frame.size != frames[0].size:
             (height, width), (rows, columns) = frame.size, frames[0].size
             raise FileFormatError(
@@ -64,11 +66,21 @@ def read_sequence(
                 f"{columns}x{rows}, {each.path} is {width}x{height}"
             )
         frames.append(frame)
-    return Sequence(tuple(frames), tuple(cuts))
+    return FrameSequence(tuple(frames), tuple(cuts))
+
+
+def _files(place: str | Path | Iterable[str | Path], name: str) -> list[FrameFiles]:
+    if isinstance(place, str | Path):
+        place = Path(place)
+        return find_frames(place / f"{name}.####.exr" if place.is_dir() else place)
+    files = [file for path in place for file in find_frames(path)]
+    if not files:
+        raise FileFormatError("a sequence needs at least one file, got none")
+    return files
 
 
 def _between(
-    files: list[FrameFiles], numbers: tuple[int, int] | None, place: Path
+    files: list[FrameFiles], numbers: tuple[int, int] | None, place: str | Path | Iterable[Any]
 ) -> list[FrameFiles]:
     if numbers is None:
         return files

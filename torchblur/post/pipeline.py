@@ -11,7 +11,7 @@ from torch import Tensor, nn
 
 from torchblur.errors import ConfigError, nearest_name
 from torchblur.frame import Frame
-from torchblur.params import Config, Param
+from torchblur.params import Config, Param, build
 from torchblur.post.bloom import Bloom, BloomConfig
 from torchblur.post.depth_of_field import DepthOfField, DepthOfFieldConfig
 from torchblur.post.fxaa import Fxaa, FxaaConfig
@@ -134,6 +134,30 @@ class FramePipeline(nn.Module):
     def forward(self, frame: Frame, **overrides: Mapping[str, Any]) -> Tensor:
         """Return the color after the last step, (B, 3, H, W); arguments as for `layers`."""
         return self.layers(frame, **overrides)["color"]
+
+    def get_extra_state(self) -> dict[str, Any]:
+        """Return the order of the steps and the switches between them, for `state_dict`."""
+        names = ("steps", "fxaa_luma", "bloom_input")
+        return self.config.model_dump(mode="json", include=set(names))
+
+    def set_extra_state(self, state: Mapping[str, Any]) -> None:
+        """Take over the order and the switches, for `load_state_dict`.
+
+        Raises:
+            ConfigError: the state is of a pipeline with other steps.
+        """
+        steps, saved = self.config.steps, state["steps"]
+        if set(saved) != set(steps):
+            raise ConfigError(
+                f"a state must be loaded into a pipeline of its steps, {', '.join(saved)}, "
+                f"got {', '.join(steps)}"
+            )
+        self.config = build(type(self.config), self.config.model_dump() | dict(state))
+
+    def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any) -> None:
+        if state_dict:  # one that torchblur 0.1 saved has no order: that of the module stays
+            state_dict = {f"{prefix}_extra_state": self.get_extra_state()} | state_dict
+        super()._load_from_state_dict(state_dict, prefix, *args)
 
     def _run(
         self, name: str, frame: Frame, passed: dict[str, Tensor], values: dict[str, Any]

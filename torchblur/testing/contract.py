@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import copy
 import dataclasses
+import io
 import pickle
 
 import pytest
@@ -196,6 +197,20 @@ class FilterContract(GradientContract, MachineContract):
         other.load_state_dict(blur.state_dict())
         assert torch.equal(self.image(other, frame), self.image(blur, frame))
         assert get_filter(self.filter_class.name) is self.filter_class
+
+    def test_a_state_brings_all_parameters(self) -> None:
+        config = self.filter_class.config_class
+        for name, value in other_values(config):
+            if isinstance(value, float):
+                value = float(f"{value:.4g}")  # a float32 knows no more than seven digits
+            file = io.BytesIO()
+            saved = self.filter_class(**{name: value})
+            torch.save(saved.state_dict(), file)
+            file.seek(0)
+            blur = self.filter_class()
+            blur.load_state_dict(torch.load(file, weights_only=True))
+            assert blur.current_config() == config(**{name: value}), name
+            assert repr(blur) == repr(saved)
 
     # -- errors --------------------------------------------------------------------------------
 

@@ -9,7 +9,7 @@ from typing import Any, Literal, get_args
 from pydantic import Field
 
 from torchblur.errors import ConfigError, nearest_name
-from torchblur.filters import get_filter, registered_filters
+from torchblur.filters import get_filter, list_filters
 from torchblur.params import Config
 from torchblur.presets import load_preset
 from tuning.bench.calls import has_taps, refuse_unknown
@@ -153,7 +153,7 @@ class _Planner:
             sizes = (*self.scale.sizes, _UHD)
         engines = self.options.engines or (("eager",) if self.options.quick else _ENGINES)
         cases = self._copies(sizes)
-        for name in self.options.filters or tuple(registered_filters()):
+        for name in self.options.filters or tuple(list_filters()):
             for engine in engines:
                 for size in sizes:
                     for case in self._cases(name, size, self.num_samples, engine):
@@ -264,7 +264,7 @@ class _Planner:
     def _swept(self, default: tuple[str, ...] = _SWEPT) -> list[tuple[str, str]]:
         names = self.options.filters or default
         if self.options.full and not self.options.filters:
-            names = tuple(registered_filters())
+            names = tuple(list_filters())
         return [(name, engine) for name in names for engine in self._engines()]
 
     def _engines(self) -> tuple[str, ...]:
@@ -285,6 +285,6 @@ _ENGINES = ("eager", "compiled")
 
 
 def _kind_has_taps(name: str) -> bool:
-    if name in registered_filters():
+    if name in list_filters():
         return has_taps(get_filter(name))
     return has_taps(get_filter(load_preset(name).filter))

@@ -85,13 +85,13 @@ def export(  # noqa: PLR0913 - each argument is an option
 
 def _loaded(preset: str, changes: list[str]) -> tuple[Preset, str]:
     """Return a preset and the name of its file, which is empty for a filter as published."""
-    from torchblur.filters import get_filter, registered_filters
+    from torchblur.filters import get_filter, list_filters
     from torchblur.params import build
     from torchblur.presets import Preset, load_preset
     from tuning.config.overrides import apply_overrides
 
     path = Path(preset)
-    if preset not in registered_filters() and (path.suffix or path.exists()):
+    if preset not in list_filters() and (path.suffix or path.exists()):
         loaded, name = load_preset(path), path.name
     else:
         loaded, name = Preset(filter=get_filter(preset).name), ""

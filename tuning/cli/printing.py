@@ -12,7 +12,7 @@ from rich.padding import Padding
 from rich.table import Table
 from rich.text import Text
 
-from torchblur.filters import BlurFilter, get_filter, registered_filters
+from torchblur.filters import BlurFilter, get_filter, list_filters
 from torchblur.io import Inspection
 from torchblur.io.inspect import ChannelInfo
 from torchblur.params import Param, choices, declared
@@ -70,9 +70,7 @@ def print_parameters(filter_name: str | None = None) -> None:
     Raises:
         ConfigError: unknown filter.
     """
-    filters = (
-        registered_filters() if filter_name is None else {filter_name: get_filter(filter_name)}
-    )
+    filters = list_filters() if filter_name is None else {filter_name: get_filter(filter_name)}
     for name, kind in filters.items():
         summary = " ".join((kind.__doc__ or "").split()).split(". ")[0].rstrip(".")
         head = Text.assemble((name, "bold"), f"  {kind.__name__}: {summary}")
@@ -89,7 +87,7 @@ def schema_text(filter_name: str | None = None) -> str:
     if filter_name is not None:
         schema: Any = get_filter(filter_name).config_class.model_json_schema()
     else:
-        schema = {n: f.config_class.model_json_schema() for n, f in registered_filters().items()}
+        schema = {n: f.config_class.model_json_schema() for n, f in list_filters().items()}
     return json.dumps(schema, indent=2, ensure_ascii=False)
 
 

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 import torch
 
-from torchblur.filters import registered_filters
+from torchblur.filters import list_filters
 from torchblur.filters.reach import Cut, ReachingBlur
 from torchblur.frame import Frame
 from torchblur.presets import DEFAULT_FILTER
@@ -56,7 +56,7 @@ def _cuts(speeds: Sequence[float]) -> dict[str, Cut]:
     row = Frame(color=torch.zeros(1, 3, 1, len(speeds)), velocity=velocity)
     found = {
         name: kind().cut(row, shutter=SHUTTER)
-        for name, kind in registered_filters().items()
+        for name, kind in list_filters().items()
         if issubclass(kind, ReachingBlur)
     }
     return {name: cut for name, cut in found.items() if cut.share > 0}

@@ -218,24 +218,35 @@ def _oberberger(config: Any) -> Cost:
     return whole + turn * int(config.second_stage_iterations)
 
 
-def _composed(config: Any) -> Cost:
-    """Return torchblur's own filter: times, turns or pairs."""
-    ways = max(config.first_direction + config.own_direction + config.second_direction, 1)
+def _torchblur(config: Any) -> Cost:
+    """Return the gather: at each time a sample of each direction, and one on the pixel's line."""
+    ways, taps, color = _ways(config), config.num_samples, _color(config.color_lookup)
+    samples = taps * (ways + 1)
+    followed = Cost(lookups=taps * ways * config.refinements)
+    main = Cost(samples, samples * (color + 1), samples * _WEIGHTS, passes=1) + followed
+    return (_two_tiles(config) + main) * _layers(config)
+
+
+def _ways(config: Any) -> int:
+    asked = (config.first_direction, config.own_direction, config.second_direction)
+    return max(sum(map(int, asked)), 1)
+
+
+def _two_tiles(config: Any) -> Cost:
+    """Return the tiles' motions, and what makes the motion at edges clean."""
     tiles = _tiles(config.tile_size, 3 if config.second_direction else 2)
-    taps, color = config.num_samples, _color(config.color_lookup)
-    if config.sampling == "times":
-        # At each time a sample of each direction, which is followed, and one on the pixel's line.
-        samples = taps * (ways + 1)
-        followed = Cost(lookups=taps * ways * config.refinements)
-        main = Cost(samples, samples * (color + 1), samples * _WEIGHTS, passes=1) + followed
-    elif config.sampling == "alternate":
+    return tiles if config.edge_motion == "own" else tiles + Cost(lookups=9, passes=1)
+
+
+def _composed(config: Any) -> Cost:
+    """Return the space of the published filters: turns or pairs."""
+    ways, taps = _ways(config), config.num_samples
+    if config.sampling == "alternate":
         main = _gather(taps, config.color_lookup, _TWO_SUMS)
     else:
         lines = ways + (1 if config.double_samples else 0)
         main = _gather(_pairs(taps), config.color_lookup, _TWO_SUMS) * lines
-    if config.edge_motion != "own":
-        main += Cost(lookups=9, passes=1)
-    whole = (tiles + main) * _layers(config)
+    whole = (_two_tiles(config) + main) * _layers(config)
     return whole + _post_filter(config, ways) if config.post_filter else whole
 
 
@@ -247,6 +258,7 @@ def _warp(config: Any) -> Cost:
 
 
 _TABLE: dict[str, Callable[[Any], Cost]] = {
+    "composed": _composed,
     "guertin2014": _reconstruction,
     "jimenez2014": _jimenez,
     "line": _line,
@@ -255,6 +267,6 @@ _TABLE: dict[str, Callable[[Any], Cost]] = {
     "oberberger2022": _oberberger,
     "sousa2013": _sousa,
     "tan2022": _tan,
-    "torchblur": _composed,
+    "torchblur": _torchblur,
     "warp": _warp,
 }

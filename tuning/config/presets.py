@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from torchblur.errors import ConfigError
-from torchblur.filters import get_filter, registered_filters
+from torchblur.filters import get_filter, list_filters
 from torchblur.presets import load_preset
 
 __all__ = ["SHUTTER_KEYS", "named_filter"]
@@ -26,7 +26,7 @@ def named_filter(name: str, folder: Path, place: str) -> tuple[str, dict[str, An
     Raises:
         ConfigError: neither a filter nor a preset.
     """
-    if name in registered_filters():
+    if name in list_filters():
         return name, {}
     if not name.endswith((".yaml", ".yml")):
         try:

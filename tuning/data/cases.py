@@ -14,7 +14,7 @@ from torch import Tensor
 
 from torchblur.errors import ConfigError
 from torchblur.filters import BlurFilter
-from torchblur.frame import Frame, Sequence, Shutter
+from torchblur.frame import Frame, FrameSequence, Shutter
 
 __all__ = ["AnyCase", "Case", "SequenceCase", "check_needs", "refuse_repeats", "with_unique_names"]
 
@@ -115,8 +115,8 @@ class SequenceCase:
 
     name: str
     split: str
-    samples: tuple[Sequence, ...]
-    sharp: Sequence | None
+    samples: tuple[FrameSequence, ...]
+    sharp: FrameSequence | None
     references: tuple[Tensor, ...]
     variances: tuple[Tensor, ...] | None
     bands: tuple[Tensor, ...]

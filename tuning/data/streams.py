@@ -13,7 +13,7 @@ from pathlib import Path
 from torch import Tensor
 
 from torchblur.errors import ConfigError, FileFormatError
-from torchblur.frame import Frame, Sequence
+from torchblur.frame import Frame, FrameSequence
 from torchblur.io import read_frame, read_image
 from torchblur.metrics import border_band
 from torchblur.render import Scene, render_frame, render_reference, render_stream
@@ -66,8 +66,8 @@ class SceneStreamJob:
         return SequenceCase(
             name=self.name,
             split=split,
-            samples=tuple(Sequence(tuple(frames), cuts) for frames in streams),
-            sharp=Sequence(tuple(sharp), cuts),
+            samples=tuple(FrameSequence(tuple(frames), cuts) for frames in streams),
+            sharp=FrameSequence(tuple(sharp), cuts),
             references=tuple(tensors["reference"] for tensors in kept),
             variances=tuple(tensors["variance"] for tensors in kept),
             bands=tuple(border_band(frame, item.exposure) for frame in sharp),
@@ -144,8 +144,8 @@ class ExrStreamJob:
         """
         item = self.item
         cuts = shot_starts(self.numbers, item.cuts, self.name)
-        samples = tuple(Sequence(self._frames(pattern), cuts) for pattern in item.stream)
-        sharp = None if item.center is None else Sequence(self._frames(item.center), cuts)
+        samples = tuple(FrameSequence(self._frames(pattern), cuts) for pattern in item.stream)
+        sharp = None if item.center is None else FrameSequence(self._frames(item.center), cuts)
         size = samples[0][0].size
         for frame in itertools.chain(*samples, sharp or ()):
             _check_size(frame.color, size, frame.source)

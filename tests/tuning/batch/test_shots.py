@@ -16,7 +16,7 @@ from typer.testing import CliRunner
 
 import tuning.batch.threads
 from torchblur.errors import ConfigError, FileFormatError, OutputError
-from torchblur.frame import Sequence
+from torchblur.frame import FrameSequence
 from torchblur.io import read_frame, read_image, save_yaml, write_frame, write_image
 from torchblur.metrics import evaluate, temporal_errors
 from tuning.batch.run import BatchConfig, plan_batch, run_batch
@@ -42,7 +42,7 @@ def write_stream(folder, numbers=range(1, 7), name="stream", seed=0):
 def expected(paths, cuts=()):
     """Return what the filter's own loop over a sequence gives."""
     with torch.no_grad():
-        return Recall().sequence(Sequence(tuple(read_frame(p) for p in paths), cuts))
+        return Recall().sequence(FrameSequence(tuple(read_frame(p) for p in paths), cuts))
 
 
 def config_for(folder, **changes):
@@ -322,9 +322,9 @@ import signal, sys, time
 # A shell starts its background jobs with SIGINT ignored, and so these tests when it runs them.
 signal.signal(signal.SIGINT, signal.default_int_handler)
 sys.path.insert(0, TESTS)
-import torchblur.filters.base
+import torchblur.filters.registry
 from planted_sequences import Recall
-torchblur.filters.base._REGISTRY["recall"] = Recall
+torchblur.filters.registry._REGISTRY["recall"] = Recall
 import tuning.batch.threads
 original = tuning.batch.threads.blur_step
 def slow(*args):

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from torchblur.errors import ConfigError
-from torchblur.filters import get_filter, registered_filters
+from torchblur.filters import get_filter, list_filters
 from tuning.bench.calls import bench_frame, make_call, make_filter, sets_of
 from tuning.bench.cases import Case
 from tuning.bench.fit_step import METRIC_PARTS, STEP_PARTS, Step, median_parts, render_parts
@@ -49,7 +49,7 @@ class TestCalls:
         assert one.shape == (3, 3, 32, 48)
         torch.testing.assert_close(torch.cat(apart), one, atol=1e-4, rtol=1e-4)
 
-    @pytest.mark.parametrize("name", sorted(registered_filters()))
+    @pytest.mark.parametrize("name", sorted(list_filters()))
     def test_each_filter_has_the_layers_it_needs(self, name):
         image = make_call(SMALL.but(filter=name, num_samples=None))()
         assert image.shape == (1, 3, 32, 48)

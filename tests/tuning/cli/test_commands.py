@@ -12,7 +12,7 @@ from PIL import Image
 from tiny_shots import HEIGHT, WIDTH, moving_square, write_channels, write_shot
 from typer.testing import CliRunner
 
-from torchblur.filters import get_filter, registered_filters
+from torchblur.filters import get_filter, list_filters
 from torchblur.frame import Shutter
 from torchblur.io import (
     read_channels,
@@ -85,7 +85,7 @@ class TestHelp:
     @pytest.mark.parametrize("name", COMMANDS)
     def test_no_parameter_has_a_flag_of_its_own(self, name):
         flags = set(re.findall(r"--([a-z-]+)", run(name, "--help").output))
-        parameters = {n for f in registered_filters().values() for n in declared(f.config_class)}
+        parameters = {n for f in list_filters().values() for n in declared(f.config_class)}
         # Those of the reference, which no filter makes, and an axis of the grid that is timed.
         others = {"render": {"shutter", "seed"}, "compare": {"shutter"}, "bench": {"num-samples"}}
         assert flags & {n.replace("_", "-") for n in parameters} == others.get(name, set())
@@ -403,7 +403,7 @@ class TestRender:
 
 class TestParams:
     @pytest.mark.parametrize("width", ["80", "200"])
-    @pytest.mark.parametrize("name", sorted(registered_filters()))
+    @pytest.mark.parametrize("name", sorted(list_filters()))
     def test_lists_each_declaration(self, name, width, monkeypatch):
         monkeypatch.setenv("COLUMNS", width)
         output = " ".join(run("params", name).output.split())
@@ -415,13 +415,13 @@ class TestParams:
 
     def test_without_a_filter_lists_all(self):
         output = run("params").output
-        for name in registered_filters():
+        for name in list_filters():
             assert name in output
 
     def test_json_schema(self):
         schema = json.loads(run("params", "line", "--json-schema").output)
         assert schema == get_filter("line").config_class.model_json_schema()
-        assert set(json.loads(run("params", "--json-schema").output)) == set(registered_filters())
+        assert set(json.loads(run("params", "--json-schema").output)) == set(list_filters())
 
 
 class TestInspect:

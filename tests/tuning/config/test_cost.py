@@ -5,7 +5,7 @@ import torch
 from planted import FIXED, PLANTED, planted_case
 
 from torchblur.errors import ConfigError
-from torchblur.filters import BlurFilter, get_filter, registered_filters
+from torchblur.filters import BlurFilter, get_filter, list_filters
 from torchblur.filters.base import FilterConfig
 from torchblur.params import declared
 from tuning.config.cost import Cost, cost_at, cost_of
@@ -27,13 +27,14 @@ TAPS = {
         "second_stage_iterations",
         "reprojection_iterations",
     ),
+    "composed": ("num_samples",),
     "torchblur": ("num_samples", "refinements"),
     "warp": ("num_samples", "supersampling"),
 }
 
 
 def _counted():
-    return [(n, p) for n, names in TAPS.items() if n in registered_filters() for p in names]
+    return [(n, p) for n, names in TAPS.items() if n in list_filters() for p in names]
 
 
 def test_guertin_as_published_is_the_unit():
@@ -74,11 +75,11 @@ def test_rises_with_each_number_of_taps(name, parameter, other):
         ("notes2025", {"double_samples": False}, {}),
         ("tan2022", {}, {"shutter_position": "centered"}),
         ("torchblur", {"second_direction": False}, {}),
-        ("torchblur", {"sampling": "alternate"}, {"sampling": "pairs"}),
+        ("composed", {"sampling": "alternate"}, {"sampling": "pairs"}),
         ("torchblur", {"color_lookup": "bilinear"}, {"color_lookup": "cubic"}),
         ("torchblur", {"edge_motion": "own"}, {}),
-        ("torchblur", {"sampling": "pairs"}, {"sampling": "pairs", "double_samples": True}),
-        ("torchblur", {}, {"post_filter": True}),
+        ("composed", {"sampling": "pairs"}, {"sampling": "pairs", "double_samples": True}),
+        ("composed", {}, {"post_filter": True}),
         ("oberberger2022", {"variance_stride": 4}, {}),
         ("oberberger2022", {"prefilter": False}, {}),
         ("oberberger2022", {"first_stage": False}, {}),
@@ -91,7 +92,7 @@ def test_counts_what_makes_a_filter_dear(name, cheap, dear):
 
 
 def test_smooth_parameters_cost_nothing():
-    for name, kind in registered_filters().items():
+    for name, kind in list_filters().items():
         if name not in TAPS:
             continue
         smooth = {
@@ -101,7 +102,7 @@ def test_smooth_parameters_cost_nothing():
 
 
 def test_every_filter_has_a_cost():
-    for name in registered_filters():
+    for name in list_filters():
         assert cost_of(name).total > 0
 
 
@@ -115,7 +116,7 @@ def test_a_filter_may_state_its_own(monkeypatch):
 
 
 def test_an_unknown_cost_says_so(monkeypatch):
-    monkeypatch.setattr("torchblur.filters.base._REGISTRY", {})
+    monkeypatch.setattr("torchblur.filters.registry._REGISTRY", {})
 
     class Odd(BlurFilter):
         name = "odd"

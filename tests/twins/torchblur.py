@@ -1,8 +1,4 @@
-"""Slow twin of torchblur's own filter, for taps that are times; written from its formulas.
-
-Per pixel, in float64. The other two kinds of taps have the twins of the published filters, whose
-special cases they are.
-"""
+"""Slow twin of torchblur's own filter; written from its formulas, per pixel, in float64."""
 
 import math
 from types import SimpleNamespace
@@ -13,14 +9,15 @@ from twins.notes2025 import tile_of, tiles_of
 from twins.reach import directions_of, taps_of
 from twins.reconstruction import length, sat, scaled
 
-DEFAULTS = common.DEFAULTS | {
+SHARED = ("shutter", "shutter_position", "background_gain", "softness", "noise", "seed")
+DEFAULTS = {name: common.DEFAULTS[name] for name in SHARED} | {
     "num_samples": 16,
     "reach": "frame",
     "max_reach": 512.0,
     "tile_size": 8,
     "early_out": 0.25,
     "tap_spacing": 3.0,
-    "max_samples": 128,
+    "max_samples": 512,
     "first_direction": True,
     "own_direction": True,
     "second_direction": True,
@@ -43,17 +40,14 @@ DEFAULTS = common.DEFAULTS | {
     "depth_compare": "relative",
     "relative_depth_extent": 0.05,
     "soft_depth_extent": 0.1,
-    "resolve": "separate",
     "missing_background": "foreground",
     "background_fade": 0.05,
-    "center_weight": False,
-    "kappa": 40.0,
     "center_taps": 0.0,
     "alpha_gain": 1.0,
 }
 
 
-def composed(color, depth, velocity, *, tap_noise=None, tile_noise=None, **changes):
+def torchblur(color, depth, velocity, *, tap_noise=None, tile_noise=None, **changes):
     """Blur one frame.
 
     color (3, H, W), depth (1, H, W), velocity (2, H, W) in px/frame; tap_noise and tile_noise
@@ -127,7 +121,7 @@ def at_pixel(pixel, starts, settings):
         arrived = [follow(pixel, starts[name], time, settings) for name in names]
         covered, shares = visible(arrived, settings)
         color = sum(w * c for w, (_, _, c) in zip(shares, arrived, strict=True))
-        front += settings.foreground_gain * covered * np.array([*color, 1.0])
+        front += covered * np.array([*color, 1.0])
         share += covered
         near = covered * (1 - abs(time) / (1 + abs(settings.c))) ** 2
         for weight, (_, z, sample) in zip(shares, arrived, strict=True):
@@ -201,15 +195,6 @@ def classes(z, z_other, settings):
 def resolved(pixel, front, back, alpha, settings):
     """Return color and alpha of the sums."""
     center = pixel.color[:, pixel.y, pixel.x]
-    if settings.resolve == "normalized":
-        own = settings.center_taps / settings.num_samples
-        if settings.center_weight:
-            speed = common.floored_length(pixel.field[pixel.y][pixel.x], settings)
-            own += 1 / (settings.kappa * speed)
-        weight = front[3] + back[3] + own
-        total = front[3] + back[3]
-        color = (front[:3] + back[:3] + own * center) / weight if weight > 0 else center
-        return color, min(total, 1)
     known = 1e-6 if settings.missing_background == "foreground" else 0
     shown = float(back[3] > known)
     if settings.background_fade > 0:

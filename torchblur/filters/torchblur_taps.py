@@ -7,15 +7,30 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from torchblur.filters.composed_gather import Added, TapOptions, sample_classes, sum_planes
-from torchblur.filters.reconstruction import Tap, sample
+from torchblur.filters.front_back import Added, sample_classes, sum_planes
+from torchblur.filters.reconstruction import ColorLookup, Tap, sample
 from torchblur.ops.gather import Inputs, Planes, read, vector, weighted
 from torchblur.ops.weights import saturate
 
-__all__ = ["fill_hidden", "time_tap"]
+__all__ = ["TimeOptions", "fill_hidden", "time_tap"]
 
 _TINY = 1e-6
 _TIE = 1e-4  # weights as close are equal: rounding must not decide
+
+
+class TimeOptions(NamedTuple):
+    """Switches of the taps; each set is compiled once."""
+
+    directions: tuple[str, ...]
+    """"first", "own", "second", "reversed": those that take part."""
+    center: int
+    refinements: int
+    one_color: bool
+    fill_hidden: bool
+    relative_depth: bool
+    shares: bool
+    softness: float
+    color_lookup: ColorLookup
 
 
 class _Arrival(NamedTuple):
@@ -28,7 +43,7 @@ class _Arrival(NamedTuple):
     """How well it does, in [0, 1]."""
 
 
-def time_tap(index: Tensor, count: Tensor, inputs: Inputs, options: TapOptions) -> Added:
+def time_tap(index: Tensor, count: Tensor, inputs: Inputs, options: TimeOptions) -> Added:
     """Return what the pixel shows at one time: what passes it then, and what else may lie behind.
 
     Each direction names a sample that would be at the pixel at this time. How well its own
@@ -53,8 +68,7 @@ def time_tap(index: Tensor, count: Tensor, inputs: Inputs, options: TapOptions) 
     some = total > _TINY
     covered = torch.where(some, 1 - open_share, 0.0)
     colors = (_first_color if options.one_color else _mean_color)(found, weights, inputs, options)
-    share = inputs["foreground_gain"] * covered
-    *front, seen = (share * plane for plane in sum_planes(*(color for _, color in colors)))
+    *front, seen = (covered * plane for plane in sum_planes(*(color for _, color in colors)))
     back, weight, hidden = _behind(time, 1 - covered, inputs, options)
     if not options.fill_hidden:
         return back, weight, tuple(front), seen, covered
@@ -80,7 +94,7 @@ def fill_hidden(back: Tensor, weight: Tensor, gain: Tensor) -> tuple[Tensor, Ten
 
 
 def _follow(
-    motion: tuple[Tensor, Tensor], time: Tensor, inputs: Inputs, options: TapOptions
+    motion: tuple[Tensor, Tensor], time: Tensor, inputs: Inputs, options: TimeOptions
 ) -> _Arrival:
     """Return the sample that moves to the pixel from where this motion would bring it."""
     dx, dy = motion
@@ -98,7 +112,7 @@ def _follow(
 
 
 def _first_color(
-    found: list[_Arrival], weights: list[Tensor], inputs: Inputs, options: TapOptions
+    found: list[_Arrival], weights: list[Tensor], inputs: Inputs, options: TimeOptions
 ) -> list[tuple[Tensor, Planes]]:
     """Return the color of the sample with the largest weight: one lookup for all."""
     x, y, most = found[0].x, found[0].y, weights[0]
@@ -111,7 +125,7 @@ def _first_color(
 
 
 def _mean_color(
-    found: list[_Arrival], weights: list[Tensor], inputs: Inputs, options: TapOptions
+    found: list[_Arrival], weights: list[Tensor], inputs: Inputs, options: TimeOptions
 ) -> list[tuple[Tensor, Planes]]:
     """Return the colors of all samples by weights that add up to 1."""
     total = sum(weights[1:], weights[0])
@@ -123,14 +137,14 @@ def _mean_color(
     return colors
 
 
-def _is_visible(tap: Tap, inputs: Inputs, options: TapOptions) -> Tensor:
+def _is_visible(tap: Tap, inputs: Inputs, options: TimeOptions) -> Tensor:
     """Return 1 unless the tap lies in front of the pixel, which may hide what it shows."""
     behind = sample_classes(inputs["depth"], tap.depth, inputs, options).background
     return (behind > 0).to(behind.dtype)
 
 
 def _behind(
-    time: Tensor, share: Tensor, inputs: Inputs, options: TapOptions
+    time: Tensor, share: Tensor, inputs: Inputs, options: TimeOptions
 ) -> tuple[Planes, Tensor, Tensor]:
     """Return color and weight of the tap on the pixel's own line behind it, and what is hidden."""
     dx, dy = vector(inputs, "half")

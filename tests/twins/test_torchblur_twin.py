@@ -2,9 +2,9 @@
 
 import pytest
 import torch
-from twins.composed import DEFAULTS, composed
+from twins.torchblur import DEFAULTS, torchblur
 
-from torchblur.filters.composed import ComposedBlur
+from torchblur.filters.torchblur import TorchblurBlur
 from torchblur.ops.noise import noise_plane
 from torchblur.testing.frames import moving_square, random_frame
 
@@ -21,8 +21,7 @@ OF_TILES = [
     {"num_samples": 5, "tile_size": 7, "refinements": 0},
     FEW | {"match_tolerance": 3.0, "match_slope": 0.2, "refinements": 1, "edge_motion": "own"},
     FEW | {"edge_motion": "surface", "edge_depth": 0.1, "depth_compare": "absolute"},
-    FEW | {"resolve": "normalized", "center_taps": 0.7, "center_weight": True, "kappa": 3.0},
-    FEW | {"resolve": "normalized", "foreground_gain": 0.4, "background_gain": 3.0},
+    FEW | {"center_taps": 0.7, "background_gain": 3.0},
     FEW | {"missing_background": "center", "background_fade": 0.5, "center_taps": 1.5},
     FEW | {"background_fade": 0.3, "alpha_gain": 0.6, "depth_level": 0.8},
     FEW | {"depth_classes": "independent", "soft_depth_extent": 0.5, "relative_depth_extent": 0.3},
@@ -46,14 +45,14 @@ CASES = [TILES | case for case in OF_TILES] + FAR
 
 
 def both(frame, params):
-    blur = ComposedBlur(**params)
+    blur = TorchblurBlur(**params)
     planes = [
         noise_plane(blur.config.noise, frame.color, stream, blur.config.seed)[0, 0].numpy()
         for stream in (0, 1)
     ]
     arrays = [plane[0].numpy() for plane in (frame.color, frame.depth, frame.velocity)]
     settings = blur.config.model_dump(include=set(DEFAULTS))
-    return blur.layers(frame), composed(
+    return blur.layers(frame), torchblur(
         *arrays, tap_noise=planes[0], tile_noise=planes[1], **settings
     )
 
@@ -84,11 +83,11 @@ def test_filter_equals_its_twin(params, make_frame):
 def test_the_comparison_can_fail():
     frame = random_frame(13, 16, dtype=torch.float64)
     layers, _ = both(frame, {})
-    other = ComposedBlur(match_tolerance=1.3)(frame).detach()
+    other = TorchblurBlur(match_tolerance=1.3)(frame).detach()
     wrong = ((other - layers["color"].detach()).abs() > 2e-5).any(1)
     assert float(wrong.double().mean()) > 0.3
 
 
 def test_the_twin_has_the_defaults_of_the_filter():
-    config = ComposedBlur().config.model_dump()
+    config = TorchblurBlur().config.model_dump()
     assert {key: config[key] for key in DEFAULTS} == DEFAULTS
