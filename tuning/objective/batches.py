@@ -14,7 +14,7 @@ from torchblur.frame import Frame
 from tuning.config.objective import ObjectiveSpec
 from tuning.data.blurring import arguments, blurred, blurred_sequence
 from tuning.objective.cpu_time import Meter
-from tuning.objective.terms import PreparedObjective, prepare_objective
+from tuning.objective.terms import PreparedObjective
 from tuning.objective.windows import AnySample, Sample, SequenceSample
 
 __all__ = ["AnyGroup", "FrameGroup", "SequenceGroup", "join", "kind_of"]
@@ -181,7 +181,7 @@ def _stacked(frames: Sequence[Frame]) -> Frame:
 
 def _prepared(spec: ObjectiveSpec, pairs: Sequence[tuple[Tensor, Tensor]]) -> PreparedObjective:
     references, bands = zip(*pairs, strict=True)
-    return prepare_objective(spec, torch.cat(references), torch.cat(bands))
+    return PreparedObjective(spec, torch.cat(references), torch.cat(bands))
 
 
 def _scored(image: Tensor, inner: Inner) -> tuple[Tensor, Tensor]:

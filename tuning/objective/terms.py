@@ -18,7 +18,7 @@ from torchblur.metrics import (
 )
 from tuning.config.objective import ObjectiveSpec
 
-__all__ = ["PreparedObjective", "prepare_objective", "tail_weights"]
+__all__ = ["PreparedObjective", "tail_weights"]
 
 _RELATIVE_FLOOR = 0.01  # radiance² below which a relative error becomes absolute
 _BEST_MSE = 1e-6  # 60 dB: better than that is hardly told apart, and log(0) has no gradient
@@ -85,11 +85,6 @@ class PreparedObjective:
         if metric == "ssim":
             return 1 - ssim(image, reference)
         return _DIFFERENCES[metric](_encode(image, self.spec.color_space), self._encoded)
-
-
-def prepare_objective(spec: ObjectiveSpec, reference: Tensor, band: Tensor) -> PreparedObjective:
-    """Return the objective against one batch of references; see `PreparedObjective`."""
-    return PreparedObjective(spec, reference, band)
 
 
 def _encode(image: Tensor, space: str) -> Tensor:

@@ -13,7 +13,7 @@ from tuning.config.data import Crops
 from tuning.config.objective import ObjectiveSpec
 from tuning.data.blurring import blurred
 from tuning.objective.problem import Problem
-from tuning.objective.terms import prepare_objective
+from tuning.objective.terms import PreparedObjective
 from tuning.objective.windows import make_samples
 
 
@@ -43,29 +43,29 @@ def single(metric, space="linear", **options):
 )
 def test_terms_are_the_metrics(pair, metric, space, expected):
     image, reference, band = pair
-    got = prepare_objective(single(metric, space), reference, band)(image)
+    got = PreparedObjective(single(metric, space), reference, band)(image)
     assert torch.allclose(got, expected(image, reference).mean(dim=(1, 2, 3)), atol=1e-6)
 
 
 def test_srgb_is_what_a_display_gets(pair):
     _, _, band = pair
     image, reference = torch.full((2, 3, 24, 32), 2.0), torch.full((2, 3, 24, 32), 0.5)
-    got = prepare_objective(single("l1", "srgb"), reference, band)(image)
+    got = PreparedObjective(single("l1", "srgb"), reference, band)(image)
     assert got.tolist() == pytest.approx([1 - 0.735357] * 2, abs=1e-5)
 
 
 def test_weights_add_up(pair):
     image, reference, band = pair
     both = ObjectiveSpec(terms={"l1": 2.0, "flip": 0.5}, color_space="linear")
-    parts = [prepare_objective(single(m), reference, band)(image) for m in ("l1", "flip")]
-    got = prepare_objective(both, reference, band)(image)
+    parts = [PreparedObjective(single(m), reference, band)(image) for m in ("l1", "flip")]
+    got = PreparedObjective(both, reference, band)(image)
     assert torch.allclose(got, 2.0 * parts[0] + 0.5 * parts[1])
 
 
 def test_band_gets_its_share(pair):
     image, reference, band = pair
     error = (image - reference).abs().mean(dim=1, keepdim=True)
-    got = prepare_objective(single("l1", band_weight=0.25), reference, band)(image)
+    got = PreparedObjective(single("l1", band_weight=0.25), reference, band)(image)
     whole, inside = error.mean(dim=(1, 2, 3)), error[0][band[0]].mean()
     assert float(got[0]) == pytest.approx(float(0.75 * whole[0] + 0.25 * inside), rel=1e-5)
     assert float(got[1]) == pytest.approx(float(whole[1]), rel=1e-5)  # no band: all is image
@@ -74,7 +74,7 @@ def test_band_gets_its_share(pair):
 def test_terms_of_the_band_stand_beside_those_of_the_image(pair):
     image, reference, band = pair
     spec = ObjectiveSpec(terms={"l1": 2.0}, band={"l1": 0.5, "mse": 3.0}, color_space="linear")
-    got = prepare_objective(spec, reference, band)(image)
+    got = PreparedObjective(spec, reference, band)(image)
     error = (image - reference).abs().mean(dim=1, keepdim=True)
     squares = ((image - reference) ** 2).mean(dim=1, keepdim=True)
     inside = [0.5 * float(e[0][band[0]].mean()) for e in (error, 2 * 3.0 * squares)]
@@ -88,14 +88,14 @@ def test_a_share_of_the_band_is_terms_of_both(pair):
     image, reference, band = pair
     share = ObjectiveSpec(terms={"flip": 1.0}, band_weight=0.25)
     terms = ObjectiveSpec(terms={"flip": 0.75}, band={"flip": 0.25})
-    losses = [prepare_objective(spec, reference, band)(image) for spec in (share, terms)]
+    losses = [PreparedObjective(spec, reference, band)(image) for spec in (share, terms)]
     assert torch.allclose(*losses, rtol=1e-5)
 
 
 class TestPsnr:
     def test_counts_ten_decibels_as_one(self):
         reference = torch.full((1, 3, 8, 8), 0.5)
-        prepared = prepare_objective(single("psnr"), reference, torch.ones(1, 1, 8, 8) > 0)
+        prepared = PreparedObjective(single("psnr"), reference, torch.ones(1, 1, 8, 8) > 0)
         losses = [float(prepared(reference + 10 ** (-db / 20))) for db in (20, 30, 40)]
         assert losses[0] - losses[1] == pytest.approx(1.0, abs=1e-3)
         assert losses == pytest.approx([(60 - db) / 10 for db in (20, 30, 40)], abs=5e-3)
@@ -103,7 +103,7 @@ class TestPsnr:
 
     def test_has_a_gradient_down_to_equality(self):
         reference = torch.full((1, 3, 8, 8), 0.5, dtype=torch.float64)
-        prepared = prepare_objective(single("psnr"), reference, torch.ones(1, 1, 8, 8) > 0)
+        prepared = PreparedObjective(single("psnr"), reference, torch.ones(1, 1, 8, 8) > 0)
         for error in (0.3, 0.01, 1e-5, 0.0):
             image = torch.full_like(reference, 0.5 + error).requires_grad_(True)
             assert torch.autograd.gradcheck(lambda i: prepared(i).double(), image, atol=1e-4)
@@ -164,7 +164,7 @@ def test_windows_are_scored_where_they_are_not_context():
         top, left, height, width = sample.inner
         image = problem.blur(sample.frame, shutter=sample.shutter.open)
         inner = image[..., top : top + height, left : left + width]
-        prepared = prepare_objective(problem.objective, sample.reference, sample.band)
+        prepared = PreparedObjective(problem.objective, sample.reference, sample.band)
         errors.append(float(prepared(inner)))
     assert any(sample.inner[:2] != (0, 0) for sample in problem.samples)
     assert float(problem.mean({})) == pytest.approx(sum(errors) / len(errors), rel=1e-5)
