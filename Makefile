@@ -49,7 +49,7 @@ bench: $(VENV)/.tune
 	$(BIN)/torchblur bench
 
 images: $(VENV)/.tune
-	$(BIN)/python -m tuning.pictures
+	$(BIN)/python -m tools.readme_images
 
 presets: $(FITS:%=runs/%/result.json)
 	$(BIN)/torchblur card $(FITS:%=runs/%) -o docs/presets --presets configs/filters --overwrite

@@ -6,7 +6,7 @@ from contextlib import contextmanager
 
 import distributed
 
-from tuning.cluster import Cluster
+from tuning.parallel.cluster import Cluster
 
 
 @contextmanager

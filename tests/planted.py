@@ -8,7 +8,7 @@ from torchblur.filters import get_filter
 from torchblur.frame import Frame, Shutter
 from torchblur.io import write_frame, write_image
 from torchblur.metrics import border_band
-from tuning.cases import Case
+from tuning.data.cases import Case
 
 PLANTED = {"kappa": 3.0, "third_gain": 5.0, "direction_exponent": 2.5}
 FIXED = {"num_samples": 11, "tile_size": 12}

@@ -13,7 +13,7 @@ from torchblur.frame import Frame, FrameSequence, Shutter
 from torchblur.io import write_frame, write_image
 from torchblur.metrics import border_band
 from torchblur.params import Param
-from tuning.cases import SequenceCase
+from tuning.data.cases import SequenceCase
 
 PLANTED_GAIN = 0.35
 

@@ -25,4 +25,6 @@ def test_the_wheel_has_types_and_version(repository, tmp_path):
     assert wheel.name == f"torchblur-{torchblur.__version__}-py3-none-any.whl"
     names = zipfile.ZipFile(wheel).namelist()
     assert {"torchblur/py.typed", "tuning/py.typed"} <= set(names)
-    assert not [name for name in names if name.startswith(("tests/", "configs/"))]
+    templates = (repository / "tuning" / "report" / "templates").iterdir()
+    assert {f"tuning/report/templates/{path.name}" for path in templates} <= set(names)
+    assert not [name for name in names if name.startswith(("tests/", "configs/", "tools/"))]

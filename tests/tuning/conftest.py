@@ -8,9 +8,9 @@ from planted_sequences import Recall
 
 import torchblur.filters.parts.registry
 from torchblur.filters import get_filter
-from tuning.config import ObjectiveSpec
-from tuning.problem import Problem
-from tuning.windows import make_samples
+from tuning.config.objective import ObjectiveSpec
+from tuning.objective.problem import Problem
+from tuning.objective.windows import make_samples
 
 
 @pytest.fixture(autouse=True)

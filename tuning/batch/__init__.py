@@ -1,0 +1,1 @@
+"""Filtering files, one or many."""

@@ -1,0 +1,1 @@
+"""Frames and sequences beside their references, and filters that make images of them."""

@@ -1,0 +1,1 @@
+"""Measurements over many fits or filters, each from one YAML file."""

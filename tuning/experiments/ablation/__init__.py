@@ -1,0 +1,1 @@
+"""A claim about a filter, measured with the feature off and on."""

@@ -1,0 +1,1 @@
+"""Fitting methods against each other."""

@@ -1,0 +1,1 @@
+"""Filters frame by frame, beside raw samples."""

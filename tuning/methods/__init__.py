@@ -1,0 +1,1 @@
+"""How parameters are found: gradients, searches, fronts, polishing and pruning."""

@@ -1,0 +1,1 @@
+"""From parameters to one number: windows, batches, terms and their reduction."""

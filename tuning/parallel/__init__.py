@@ -1,0 +1,1 @@
+"""Work shared out: a Dask cluster, the ranks of torchrun, processes of this machine."""

@@ -1,0 +1,1 @@
+"""Scenes, and scenes of families, rendered to files."""

@@ -1,0 +1,1 @@
+"""Pages, plots and comparisons that show what was found."""

@@ -1,0 +1,1 @@
+"""What result.json of a fit holds."""

@@ -1,0 +1,1 @@
+"""How good images are: figures of frames and sequences, beside baselines."""
