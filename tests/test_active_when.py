@@ -75,6 +75,7 @@ def test_what_waits_for_what_waits_waits_too():
     found = idle(model, {"resolution": "full", "alpha_fade": True})
     assert found["alpha_fade"] == found["fade_start"] == "resolution == half"
     assert "fade_start" not in idle(model, {"resolution": "half"})
+    assert "fade_start" not in idle(model, {}, free={"resolution"})
 
 
 def test_a_condition_that_is_none_is_refused():
@@ -84,4 +85,4 @@ def test_a_condition_that_is_none_is_refused():
 
 def test_of_the_default_filter_little_waits():
     model = get_filter("torchblur").config_class
-    assert len(idle(model, {})) <= 9
+    assert len(idle(model, {})) <= 7

@@ -17,7 +17,7 @@ from __future__ import annotations
 import math
 import operator
 import re
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from typing import Any, Literal, TypeVar, get_args
 
@@ -99,14 +99,6 @@ class Param:
         """What `active_when` says: name, comparison and value of each part."""
         found = _CLAUSE.findall(self.active_when)
         return tuple((name, compare, _literal(text)) for name, compare, text in found)
-
-    def acts(self, values: Mapping[str, Any]) -> bool:
-        """Return whether the parameter can change anything.
-
-        Args:
-            values: Of all parameters that `active_when` names.
-        """
-        return all(_COMPARE[how](values[name], value) for name, how, value in self.conditions)
 
     @property
     def range_text(self) -> str:
@@ -204,7 +196,9 @@ def declared(model: type[BaseModel]) -> dict[str, Param]:
     return specs
 
 
-def idle(model: type[BaseModel], values: Mapping[str, Any]) -> dict[str, str]:
+def idle(
+    model: type[BaseModel], values: Mapping[str, Any], free: Collection[str] = ()
+) -> dict[str, str]:
     """Return the parameters that change nothing with these values, and what they wait for.
 
     What waits for a parameter that itself cannot act waits, too.
@@ -212,15 +206,19 @@ def idle(model: type[BaseModel], values: Mapping[str, Any]) -> dict[str, str]:
     Args:
         model: A configuration class.
         values: Of its parameters; the defaults of those that are left out.
+        free: Names of parameters that may take any value: nothing waits for these.
     """
     specs = declared(model)
     given = {name: values.get(name, field.default) for name, field in model.model_fields.items()}
 
     def waits(name: str) -> str:
         spec = specs[name]
-        if not spec.acts(given):
-            return spec.active_when
-        return next(filter(None, (waits(other) for other, *_ in spec.conditions)), "")
+        for other, how, value in spec.conditions:
+            if other not in free and not _COMPARE[how](given[other], value):
+                return next(c for c in spec.active_when.split(" and ") if c.startswith(f"{other} "))
+            if reason := waits(other):
+                return reason
+        return ""
 
     return {name: reason for name in specs if (reason := waits(name))}
 

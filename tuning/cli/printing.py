@@ -102,7 +102,7 @@ def _parameters(kind: type[BlurFilter]) -> Any:
         scale = spec.scale if spec.low is not None else ""
         unit = "" if spec.unit == "1" else spec.unit
         cells = (name, spec.symbol, values[name], _range(kind, name, spec), unit, scale)
-        table.add_row(*map(Text, (*cells, spec.grad, spec.meaning, spec.source)))
+        table.add_row(*map(Text, (*cells, spec.grad, _meaning(spec), spec.source)))
     return table
 
 
@@ -116,8 +116,12 @@ def _entry(kind: type[BlurFilter], name: str, spec: Param, default: str) -> Any:
         f" = {default}",
         (f"   {_range(kind, name, spec)}{unit}{scale}, {spec.grad}", "green"),
     )
-    text = Text.assemble(spec.meaning, (f" ({spec.source})", "dim"))
+    text = Text.assemble(_meaning(spec), (f" ({spec.source})", "dim"))
     return Group(Padding(head, (0, 0, 0, 2)), Padding(text, (0, 0, 0, 6)))
+
+
+def _meaning(spec: Param) -> str:
+    return f"{spec.meaning}; acts when {spec.active_when}" if spec.active_when else spec.meaning
 
 
 def _range(kind: type[BlurFilter], name: str, spec: Param) -> str:

@@ -17,7 +17,7 @@ from torchblur.errors import ConfigError, FileFormatError, nearest_name
 from torchblur.filters import get_filter
 from torchblur.io import load_yaml
 from torchblur.ops.compiling import EngineChoice
-from torchblur.params import Config, build, choices, declared
+from torchblur.params import Config, build, choices, declared, idle
 from tuning.config.cost_limits import check_costs
 from tuning.config.data import DataSpec
 from tuning.config.methods import GradientMethod, Method, check_method, check_refresh
@@ -184,6 +184,7 @@ def resolve_filter(spec: FilterSpec, place: str, folder: Path) -> FilterSpec:
     spec = _checked_params(_without_preset(spec, place, folder), place)
     for name, limits in spec.free.items():
         _check_range(spec, name, limits, f"{place}: " if place else "")
+    _check_acts(spec, place)
     return spec
 
 
@@ -272,6 +273,17 @@ def _check_range(spec: FilterSpec, name: str, limits: FreeRange, place: str) -> 
             raise ConfigError(f"`{name}` needs `choices` {where}")
         return
     _check_narrowed(spec, name, limits, where)
+
+
+def _check_acts(spec: FilterSpec, place: str) -> None:
+    """Refuse to fit what cannot change anything."""
+    waiting = idle(get_filter(spec.kind).config_class, spec.params, {*spec.free, *SHUTTER_KEYS})
+    for name in spec.free:
+        if name in waiting:
+            raise ConfigError(
+                f"`{name}` of {spec.kind} acts only with `{waiting[name]}`: set that under "
+                f"filter.params, or do not fit it ({_join(place, f'filter.free.{name}')})"
+            )
 
 
 def _check_narrowed(spec: FilterSpec, name: str, limits: FreeRange, where: str) -> None:

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from torchblur.filters import BlurFilter, get_filter
+from torchblur.params import declared
 from torchblur.presets import Preset, save_preset
 from tuning.config.fit import TuneConfig, resolve
 from tuning.config.methods import GradientMethod
@@ -24,6 +25,7 @@ from tuning.files.run_folder import RunFolder, open_run
 from tuning.fit.ceiling import ceiling
 from tuning.fit.front_scores import budget_notes, judged
 from tuning.methods.run import run_methods
+from tuning.objective.effect import without_effect
 from tuning.objective.prepare import Prepared, fit_device, prepare
 from tuning.objective.problem import Problem
 from tuning.objective.sensitivity import measure_sensitivity
@@ -45,6 +47,9 @@ from tuning.results.fit import (
 from tuning.scoring.cases import score_cases, score_variant
 
 __all__ = ["run_fit"]
+
+_EDGE = 0.005  # of a range
+_NO_EFFECT = "`{}` changes nothing on the frames of the fit, whatever its value."
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -119,9 +124,9 @@ def _fit(
 ) -> FitResult:
     began = time.monotonic()
     finished = folder.path / "result.json"
-    if finished.is_file() and (folder.path / "report.html").is_file():
-        return FitResult.load(finished)
-    setting = _prepare(config, folder, progress)
+    if finished.is_file():
+        return _finished(config, folder, progress, FitResult.load(finished))
+    setting = _told(_prepare(config, folder, progress))
     if spread is not None:
         problem = spread(config, setting.problem)
         setting = dataclasses.replace(setting, problem=problem)
@@ -129,10 +134,29 @@ def _fit(
     result, variants = _evaluate(setting, methods, began)
     _write_preset(setting, result)
     folder.write("result.json", result.model_dump_json(indent=2))
-    stage = Stage("report", 1, progress)
-    write_report(folder, config, result, setting.cases, variants)
-    stage.step(1)
+    _report(setting, result, variants)
     return result
+
+
+def _finished(
+    config: TuneConfig, folder: RunFolder, progress: Progress | None, result: FitResult
+) -> FitResult:
+    """Write what a run that has its result lacks beside it."""
+    missing = {name for name in ("preset.yaml", "report.html") if not (folder.path / name).exists()}
+    if missing:
+        setting = _prepare(config, folder, progress)
+        if "preset.yaml" in missing:
+            _write_preset(setting, result)
+        tuned = {parameter.name: parameter.tuned for parameter in result.parameters}
+        _report(setting, result, _variants(setting, result.methods, tuned))
+    return result
+
+
+def _report(setting: _Setting, result: FitResult, variants: Sequence[Variant]) -> None:
+    stage = Stage("report", 1, setting.progress)
+    stage.step(0, message="pictures of the frames")
+    write_report(setting.folder, setting.config, result, setting.cases, variants)
+    stage.step(1)
 
 
 # -- stages ----------------------------------------------------------------------------------------
@@ -140,12 +164,19 @@ def _fit(
 
 def _prepare(config: TuneConfig, folder: RunFolder, progress: Progress | None) -> _Setting:
     ready = prepare(config, _data_reporter(progress))
-    total = len(ready.cases)
-    for note in ready.notes:
-        folder.log(note=note)
-        if progress is not None:
-            progress(ProgressEvent(stage="data", done=total, total=total, message=note))
     return _Setting(**vars(ready), config=config, folder=folder, progress=progress)
+
+
+def _told(setting: _Setting) -> _Setting:
+    """Tell what the user should know before the first trial."""
+    idle = without_effect(setting.problem, setting.space)
+    notes = (*setting.notes, *map(_NO_EFFECT.format, idle))
+    total = len(setting.cases)
+    for note in notes:
+        setting.folder.log(note=note)
+        if setting.progress is not None:
+            setting.progress(ProgressEvent(stage="data", done=total, total=total, message=note))
+    return dataclasses.replace(setting, notes=notes)
 
 
 def _evaluate(
@@ -173,7 +204,7 @@ def _evaluate(
         parameters=_parameters(setting.space, tuned, slopes),
         methods=tuple(methods),
         scores=tuple(scores),
-        notes=setting.notes + budget_notes(methods),
+        notes=setting.notes + budget_notes(methods) + _edge_notes(setting, tuned),
         seed=setting.config.seed,
         command=_command(),
         versions=_versions(),
@@ -255,6 +286,26 @@ def _parameters(
             )
         )
     return tuple(rows)
+
+
+def _edge_notes(setting: _Setting, tuned: dict[str, Any]) -> tuple[str, ...]:
+    """Return what ended at the edge of its range, where a better value may lie beyond."""
+    notes, specs = [], declared(setting.blur.config_class)
+    for p in setting.space.parameters:
+        value = tuned[p.name]
+        if p.choices or value == p.start:
+            continue
+        (place,) = setting.space.subset((p.name,)).to_unit(tuned).tolist()
+        end = round(place)
+        if abs(place - end) <= _EDGE:
+            limit = p.spec.bounds[end]
+            beyond = (
+                "the filter takes no more" if limit == specs[p.name].bounds[end] else "widen it"
+            )
+            notes.append(
+                f"`{p.name}` ended at the edge of its range, {value:g} of {limit:g}; {beyond}."
+            )
+    return tuple(notes)
 
 
 def _unroll(config: TuneConfig) -> int | None:

@@ -133,6 +133,10 @@ def test_bad_overrides(text, message):
             changed(filter={"free": ["num_samples"]}),
             r"`num_samples` is discrete and has no usable gradient; fit it with a `blackbox`",
         ),
+        (
+            changed(filter={"free": ["kappa"], "params": {"center_weight": False}}),
+            r"`kappa` of guertin2014 acts only with `center_weight == true`: .*filter\.free\.kappa",
+        ),
         (changed(filter={"free": ["gamma"]}), r"`gamma` is weak and has no usable gradient"),
         (
             changed(methods=[{"kind": "gradient", "free": ["kapa"]}]),
@@ -164,6 +168,16 @@ def test_mistakes_name_rule_value_and_place(tmp_path, monkeypatch, data, message
     save_yaml("x.yaml", data)
     with pytest.raises(ConfigError, match=message):
         load_tune_config("x.yaml")
+
+
+def test_what_a_free_switch_may_turn_on_can_be_fitted(tmp_path):
+    free = {"kappa": None, "center_weight": None}
+    data = changed(
+        filter={"free": free, "params": {"center_weight": False}},
+        methods=[{"kind": "blackbox", "trials": 2}],
+    )
+    config = resolve(build(TuneConfig, data), folder=tmp_path)
+    assert tuple(config.filter.free) == ("kappa", "center_weight")
 
 
 def test_a_missing_file_is_named(tmp_path):

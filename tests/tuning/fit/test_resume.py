@@ -1,6 +1,7 @@
 """A run that is killed at any moment goes on and ends where it would have ended."""
 
 import json
+import shutil
 import signal
 import subprocess
 import sys
@@ -235,3 +236,18 @@ def test_torn_line(tmp_path, before, after):
     (tmp_path / "log").write_text(before)
     trim_torn_line(tmp_path / "log")
     assert (tmp_path / "log").read_text() == after
+
+
+@pytest.mark.parametrize("lost", ["report.html", "preset.yaml"])
+def test_a_finished_run_gets_what_it_lacks_and_nothing_else(whole, tmp_path, monkeypatch, lost):
+    folder = tmp_path / "run"
+    shutil.copytree(whole[0], folder)
+    before = {path.name: path.read_bytes() for path in folder.iterdir() if path.is_file()}
+    (folder / lost).unlink()
+    monkeypatch.setattr("tuning.fit.run._evaluate", None)
+    monkeypatch.setattr("tuning.fit.run.run_methods", None)
+    config = load_tune_config(folder / "config.yaml")
+    assert outcome(run_fit(config, folder, resume=True)) == outcome(whole[1])
+    assert (folder / lost).stat().st_size == pytest.approx(len(before[lost]), rel=0.2)
+    for name in ("result.json", "config.yaml"):
+        assert (folder / name).read_bytes() == before[name]

@@ -4,7 +4,7 @@ import json
 
 import pytest
 import torch
-from planted import PLANTED, write_planted
+from planted import FIXED, PLANTED, write_planted
 
 import tuning.methods.gradient_state
 import tuning.objective.batches
@@ -304,6 +304,30 @@ class TestRun:
         result = run_fit(build(TuneConfig, planted_folders), tmp_path / "run")
         ceiling = result.mean("ceiling", "holdout", "psnr")
         assert ceiling >= result.mean("tuned", "holdout", "psnr") - 1e-6
+
+    def test_a_parameter_at_the_edge_of_its_range_is_told(self, planted_folders, tmp_path):
+        descent = {"kind": "gradient", "steps": 8, "starts": 1, "learning_rate": 0.3}
+        data = planted_folders | {"methods": [descent]}
+        data["filter"] = {
+            "kind": "guertin2014",
+            "params": FIXED | PLANTED | {"third_gain": 2.0},
+            "free": {"third_gain": {"low": 1.5, "high": 2.2}},
+        }
+        result = run_fit(build(TuneConfig, data), tmp_path / "run")
+        (note,) = (note for note in result.notes if "edge" in note)
+        assert note.startswith("`third_gain` ended at the edge of its range, 2")
+        assert note.endswith(" of 2.2; widen it.")
+        assert note in (tmp_path / "run" / "report.html").read_text()
+
+    def test_what_changes_nothing_is_told_before_the_first_trial(self, planted_folders, tmp_path):
+        free = ["kappa", "soft_depth_extent", "depth_compare"]  # the two depths lie far apart
+        data = planted_folders | {"methods": [{"kind": "blackbox", "trials": 2}]}
+        data["filter"] = data["filter"] | {"free": free}
+        events = []
+        result = run_fit(build(TuneConfig, data), tmp_path / "run", progress=events.append)
+        (place,) = (i for i, e in enumerate(events) if "`soft_depth_extent` changes" in e.message)
+        assert not any(event.stage.startswith("tpe") for event in events[:place])
+        assert sum("changes nothing" in note for note in result.notes) == 2
 
     def test_folder_that_is_there(self, config, tmp_path):
         (tmp_path / "mine").mkdir()
