@@ -5,10 +5,13 @@ Only what the help needs is imported here; torch comes with the command that nee
 
 from __future__ import annotations
 
+import itertools
+import os
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from importlib.metadata import version
+from pathlib import Path
 from typing import Annotated, Any
 
 import typer
@@ -28,12 +31,18 @@ __all__ = ["app"]
 
 
 class _Commands(TyperGroup):
-    """Turns errors into one message and an exit code; takes --debug anywhere."""
+    """Turns errors into one message and an exit code; takes --debug and --plugin anywhere."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        if "--debug" in args:
-            args = ["--debug", *(arg for arg in args if arg != "--debug")]
-        return super().parse_args(ctx, args)
+        first, rest, words = [], [], iter(args)
+        for word in words:
+            if word == "--debug" or word.startswith("--plugin="):
+                first.append(word)
+            elif word == "--plugin":
+                first += [word, *itertools.islice(words, 1)]
+            else:
+                rest.append(word)
+        return super().parse_args(ctx, [*first, *rest])
 
     def invoke(self, ctx: Any) -> Any:
         with _readable_errors(debug=bool(ctx.params.get("debug"))), _readable_warnings():
@@ -120,8 +129,20 @@ def _options(
         typer.Option("--version", callback=_show_version, is_eager=True, help="Print the version."),
     ] = False,
     debug: Annotated[bool, typer.Option("--debug", help="Show the traceback of errors.")] = False,
+    plugin: Annotated[
+        list[Path] | None,
+        typer.Option(
+            help="Python file with filters of your own, beside those that are built in; repeatable."
+        ),
+    ] = None,
 ) -> None:
-    pass
+    if plugin:
+        from torchblur.filters import PLUGINS, list_filters
+
+        # Processes that are started later find the filters by the same variable.
+        before = filter(None, [os.environ.get(PLUGINS)])
+        os.environ[PLUGINS] = os.pathsep.join([*before, *(str(p.resolve()) for p in plugin)])
+        list_filters()
 
 
 app.command()(tune)

@@ -5,10 +5,13 @@ entry points, so that they are found wherever the package is installed::
 
     [project.entry-points."torchblur.filters"]
     mine = "my_package.blur:MyBlur"      # or a module whose import makes the classes
+
+Files that the variable TORCHBLUR_PLUGINS names, as PATH names folders, are loaded likewise.
 """
 
 from __future__ import annotations
 
+import os
 import sys
 import threading
 import traceback
@@ -29,10 +32,20 @@ from torchblur.errors import ConfigError, FileFormatError, nearest_name
 if TYPE_CHECKING:
     from torchblur.filters.parts.base import BlurFilter
 
-__all__ = ["ENTRY_POINTS", "get_filter", "list_filters", "load_plugin", "register_filter"]
+__all__ = [
+    "ENTRY_POINTS",
+    "PLUGINS",
+    "get_filter",
+    "list_filters",
+    "load_plugin",
+    "register_filter",
+]
 
 ENTRY_POINTS = "torchblur.filters"
 """Group of entry points by which a package offers its filters."""
+
+PLUGINS = "TORCHBLUR_PLUGINS"
+"""Environment variable with Python files that make filters, for a process and those it starts."""
 
 FilterT = TypeVar("FilterT", bound="type[BlurFilter]")
 
@@ -70,7 +83,7 @@ def register_filter(cls: FilterT) -> FilterT:
 
 
 def list_filters() -> dict[str, type[BlurFilter]]:
-    """Return the filters by name, those of installed packages among them."""
+    """Return the filters by name, those of installed packages and of plugins among them."""
     _load_installed()
     return dict(sorted(_REGISTRY.items()))
 
@@ -145,7 +158,11 @@ def _all_or_nothing() -> Iterator[dict[str, type[BlurFilter]]]:
 
 
 def _load_installed() -> None:
-    """Load all entry points, once; one warning for each that is broken."""
+    """Load all entry points and the files of `PLUGINS`, once.
+
+    An entry point that is broken is one warning; a file that is, which somebody asked for, an
+    error.
+    """
     global _searched
     with _LOCK:
         if _searched:
@@ -162,6 +179,12 @@ def _load_installed() -> None:
                     f"{type(error).__name__}: {error} (entry point {entry.value})",
                     stacklevel=3,
                 )
+        try:
+            for path in filter(None, os.environ.get(PLUGINS, "").split(os.pathsep)):
+                load_plugin(path)
+        except BaseException:
+            _searched = False
+            raise
 
 
 def _load_entry(entry: EntryPoint) -> None:
