@@ -27,4 +27,7 @@ def test_the_wheel_has_types_and_version(repository, tmp_path):
     assert {"torchblur/py.typed", "tuning/py.typed"} <= set(names)
     templates = (repository / "tuning" / "report" / "templates").iterdir()
     assert {f"tuning/report/templates/{path.name}" for path in templates} <= set(names)
+    for folder in ("scenes", "families"):
+        scenes = (repository / "configs" / folder).glob("*.yaml")
+        assert {f"tuning/configs/{folder}/{path.name}" for path in scenes} <= set(names)
     assert not [name for name in names if name.startswith(("tests/", "configs/", "tools/"))]

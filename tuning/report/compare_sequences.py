@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -25,6 +26,7 @@ __all__ = ["compare_sequences", "is_sequence"]
 
 Figures = Mapping[str, float]
 
+_NAMED = 8
 _FIRST = ("flip", "flip_median", "psnr", "ssim", "temporal")
 
 
@@ -54,7 +56,8 @@ def compare_sequences(
 ) -> Comparison:
     """Compare image files with references, frame by frame.
 
-    The frames are those of the first sequence; a number that is missing there begins a new shot.
+    The frames are those of the first sequence; a number that is missing there begins a new shot,
+    and a warning names it.
 
     Args:
         paths: Patterns with ####, EXR or PNG.
@@ -73,6 +76,7 @@ def compare_sequences(
         FrameError: NaN or inf, or sizes that differ; with both files.
     """
     numbers = frame_numbers(paths[0].parent, paths[0].name, "IMAGE")
+    _tell_missing(numbers, paths[0], reference)
     cuts = shot_starts(numbers, (), "")
     names = short_names(paths)
     rows: list[dict[str, Figures]] = []
@@ -118,6 +122,21 @@ def _images(
         images[name] = read_color(path)
         check_size(images[name], path, target, place)
     return images
+
+
+def _tell_missing(numbers: Sequence[int], images: Path, reference: Path) -> None:
+    """Warn of frames without an image: between the others, or of which there is a reference."""
+    known = set(frame_numbers(reference.parent, reference.name, "--reference"))
+    whole = known.union(range(numbers[0], numbers[-1] + 1))
+    missing = sorted(whole - set(numbers))
+    if missing:
+        first = ", ".join(map(str, missing[:_NAMED]))
+        more = f" and {len(missing) - _NAMED} more" if len(missing) > _NAMED else ""
+        warnings.warn(
+            f"{images} lacks {len(missing)} of {len(whole)} frames: {first}{more}; the figures are "
+            f"those of the other {len(numbers)}",
+            stacklevel=3,
+        )
 
 
 def _file(pattern: Path, number: int) -> Path:

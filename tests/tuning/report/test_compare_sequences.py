@@ -60,9 +60,19 @@ class TestFigures:
     def test_a_missing_number_is_no_change(self, shot):
         for path in shot.glob("*.0003.exr"):
             path.unlink()
-        found = compared(shot, "flicker")
+        with pytest.warns(
+            UserWarning, match=r"flicker\.####\.exr lacks 1 of 4 frames: 3; .* other 3"
+        ):
+            found = compared(shot, "flicker")
         assert found.frames == "3 frames"
         assert found.scores["flicker.####.exr"]["temporal"] == 0
+
+    @pytest.mark.parametrize("number", [1, 4])
+    def test_frames_that_only_the_reference_has_are_named(self, shot, number):
+        (shot / f"flicker.{number:04d}.exr").unlink()
+        text = f"lacks 1 of 4 frames: {number}; the figures are those of the other 3"
+        with pytest.warns(UserWarning, match=text):
+            compared(shot, "flicker")
 
     def test_the_worst_frame_is_shown(self, shot):
         found = compared(shot, "flicker", "steady")
