@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from torchblur.filters.parts.base import BlurFilter, FilterConfig, Values
+from torchblur.filters.parts.cost import Cost, color_lookup
 from torchblur.frame import LONGEST_SHUTTER, Frame, Shutter
 from torchblur.ops.gather import (
     Engine,
@@ -103,6 +104,12 @@ class LineBlur(BlurFilter):
     published = False
     config_class = LineConfig
     per_frame = ()
+
+    @classmethod
+    def cost(cls, config: Any) -> Cost:
+        """Return what it costs, counted from its configuration."""
+        taps = config.num_samples
+        return Cost(taps, taps * color_lookup(config.lookup), passes=1)
 
     def compute(self, frame: Frame, values: Values) -> dict[str, Tensor]:
         """Return the blurred "color"."""

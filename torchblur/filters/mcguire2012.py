@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from torchblur.filters.parts.base import Values
+from torchblur.filters.parts.cost import Cost, gather, tiles, with_background
 from torchblur.filters.parts.moving import Filtered, Moving, moving_part, revealed_part
 from torchblur.filters.parts.reach import ReachingBlur, by_length
 from torchblur.filters.parts.reconstruction import (
@@ -117,6 +118,12 @@ class McGuire2012Blur(ReachingBlur):
     name = "mcguire2012"
     config_class = McGuire2012Config
     per_frame = ("shutter",)
+
+    @classmethod
+    def cost(cls, config: Any) -> Cost:
+        """Return what it costs, counted from its configuration."""
+        whole = tiles(config.tile_size) + gather(config.num_samples, config.color_lookup)
+        return with_background(whole, config)
 
     def compute(self, frame: Frame, values: Values) -> dict[str, Tensor]:
         """Return "color", "tile_max", "neighbor_max" and "weight"."""

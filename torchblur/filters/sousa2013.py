@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from torchblur.filters.parts.base import Values
+from torchblur.filters.parts.cost import Cost, gather, tiles
 from torchblur.filters.parts.reach import ReachingBlur, by_length, longest_spread, tap_counts
 from torchblur.filters.parts.reconstruction import (
     WEIGHT_PARAMETERS,
@@ -160,6 +161,12 @@ class Sousa2013Blur(ReachingBlur):
 
     name = "sousa2013"
     config_class = Sousa2013Config
+
+    @classmethod
+    def cost(cls, config: Any) -> Cost:
+        """Return what it costs, counted from its configuration."""
+        one = gather(config.num_samples, config.color_lookup)
+        return tiles(config.tile_size) + one * int(config.passes)
 
     def compute(self, frame: Frame, values: Values) -> dict[str, Tensor]:
         """Return "color", "first_pass", "weight" and the tiles."""

@@ -20,8 +20,11 @@ from torchblur.filters.guertin2014.filter import center_direction
 from torchblur.filters.notes2025.gather import Line
 from torchblur.filters.notes2025.post_filter import post_filter
 from torchblur.filters.parts.base import Values
+from torchblur.filters.parts.cost import TWO_SUMS, Cost, even, gather, with_background
+from torchblur.filters.parts.cost import post_filter as post_filter_cost
 from torchblur.filters.parts.edges import clean_edges, half_spreads
 from torchblur.filters.parts.front_back import Blurred, Sums, compose, over_nothing, tap_inputs
+from torchblur.filters.parts.front_back_config import motion_cost, num_ways
 from torchblur.filters.parts.moving import least_spread, moving_pixels, packed_values, tile_planes
 from torchblur.filters.parts.places import SHORTEST_REACH, num_pairs
 from torchblur.filters.parts.reach import Gather, ReachingBlur, by_length, tap_counts
@@ -80,6 +83,17 @@ class ComposedBlur(ReachingBlur):
     name = "composed"
     published = False
     config_class = ComposedConfig
+
+    @classmethod
+    def cost(cls, config: Any) -> Cost:
+        """Return what it costs, counted from its configuration."""
+        ways, taps = num_ways(config), config.num_samples
+        main = gather(taps, config.color_lookup, TWO_SUMS)
+        if config.sampling == "pairs":
+            lines = ways + (1 if config.double_samples else 0)
+            main = gather(even(taps), config.color_lookup, TWO_SUMS) * lines
+        whole = with_background(motion_cost(config) + main, config)
+        return whole + post_filter_cost(config.post_samples, ways) if config.post_filter else whole
 
     def compute(self, frame: Frame, values: Values) -> dict[str, Tensor]:
         """Return "color", the alphas, "weight" and the tiles."""

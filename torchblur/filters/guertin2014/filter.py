@@ -9,6 +9,7 @@ from torch import Tensor
 
 from torchblur.filters.guertin2014.config import Guertin2014Config
 from torchblur.filters.parts.base import Values
+from torchblur.filters.parts.cost import Cost, gather, tiles, with_background
 from torchblur.filters.parts.moving import Filtered, Moving, Stray, moving_part, revealed_part
 from torchblur.filters.parts.reach import ReachingBlur, by_length
 from torchblur.filters.parts.reconstruction import WEIGHT_PARAMETERS, Tap, is_one, resolve, sample
@@ -96,6 +97,14 @@ class Guertin2014Blur(ReachingBlur):
     name = "guertin2014"
     config_class = Guertin2014Config
     per_frame = ("shutter",)
+
+    @classmethod
+    def cost(cls, config: Any) -> Cost:
+        """Return what it costs, counted from its configuration."""
+        whole = tiles(config.tile_size) + gather(config.num_samples, config.color_lookup)
+        if config.sample_assignment == "variance":
+            whole += Cost(lookups=9, passes=1) * (1 / config.tile_size**2)
+        return with_background(whole, config)
 
     def compute(self, frame: Frame, values: Values) -> dict[str, Tensor]:
         """Return "color", "luma", "weight" and the tiles."""

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from torchblur.filters.jimenez2014.config import Jimenez2014Config
 from torchblur.filters.parts.base import Values
+from torchblur.filters.parts.cost import Cost, even, gather, tiles, with_background
 from torchblur.filters.parts.moving import (
     Filtered,
     Moving,
@@ -97,6 +98,14 @@ class Jimenez2014Blur(ReachingBlur):
     name = "jimenez2014"
     config_class = Jimenez2014Config
     per_frame = ("shutter", "early_out", "fast_ratio", "tile_jitter")
+
+    @classmethod
+    def cost(cls, config: Any) -> Cost:
+        """Return what it costs, counted from its configuration."""
+        taps = even(config.num_samples)
+        return with_background(
+            tiles(config.tile_size, 2) + gather(taps, config.color_lookup), config
+        )
 
     def compute(self, frame: Frame, values: Values) -> dict[str, Tensor]:
         """Return "color", "alpha", "tile_class" and the tiles."""

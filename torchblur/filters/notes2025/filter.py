@@ -13,6 +13,16 @@ from torchblur.filters.notes2025.config import Notes2025Config
 from torchblur.filters.notes2025.gather import SHARED_PARAMETERS, Line, gather_line, shared_inputs
 from torchblur.filters.notes2025.post_filter import post_filter
 from torchblur.filters.parts.base import Values
+from torchblur.filters.parts.cost import (
+    TWO_SUMS,
+    WEIGHTS,
+    Cost,
+    even,
+    gather,
+    tiles,
+    with_background,
+)
+from torchblur.filters.parts.cost import post_filter as post_filter_cost
 from torchblur.filters.parts.front_back import Blurred, compose
 from torchblur.filters.parts.moving import (
     least_spread,
@@ -91,6 +101,23 @@ class Notes2025Blur(ReachingBlur):
         for name, spec in declared(Notes2025Config).items()
         if spec.grad != "discrete" and name not in SHARED_PARAMETERS
     )
+
+    @classmethod
+    def cost(cls, config: Any) -> Cost:
+        """Return what it costs, counted from its configuration."""
+        lines, full = 1 if config.directions == "one" else 2, config.resolution == "full"
+        size = config.tile_size if full else (config.tile_size + 1) // 2
+        taps = even(config.num_samples)
+        main = gather(taps * (2 if config.double_samples else 1), config.color_lookup, TWO_SUMS)
+        main += gather(taps, config.color_lookup, TWO_SUMS) * (lines - 1)
+        whole = with_background(main + tiles(size, 1 + lines), config)
+        if config.post_filter:
+            whole += post_filter_cost(config.post_samples, lines)
+        if full:
+            return whole
+        # Down: 2x2 pixels of color, motion and depth, once for four. Up: four small ones and their
+        # depth around each pixel.
+        return whole * 0.25 + Cost(lookups=2, passes=0.25) + Cost(4, 8, 4 * WEIGHTS, passes=1)
 
     def compute(self, frame: Frame, values: Values) -> dict[str, Tensor]:
         """Return "color", the alphas, "weight", "influence" and the tiles."""

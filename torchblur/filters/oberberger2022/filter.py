@@ -27,6 +27,7 @@ from torchblur.filters.oberberger2022.stages import (
     untouched,
 )
 from torchblur.filters.parts.base import History, TemporalBlur, Values
+from torchblur.filters.parts.cost import TWO_SUMS, WEIGHTS, Cost, color_lookup
 from torchblur.frame import Frame
 from torchblur.ops.points import points_where, put, take
 
@@ -107,6 +108,25 @@ class Oberberger2022Blur(TemporalBlur):
     name = "oberberger2022"
     config_class = Oberberger2022Config
     needs = ("time", "depth")
+
+    @classmethod
+    def cost(cls, config: Any) -> Cost:
+        """Return what it costs, counted from its configuration."""
+        taps = 5 * 5
+        kernel = Cost(taps, 2 * taps, taps * TWO_SUMS, passes=1)
+        looks = config.variance_window**2 / config.variance_stride**2
+        whole = Cost(looks, looks, looks * WEIGHTS, passes=1)
+        if config.prefilter:
+            drawn = 9 * config.prefilter_samples
+            whole += Cost(drawn, drawn, drawn * WEIGHTS, passes=1)
+        whole += kernel if config.first_stage else Cost(1, 2, TWO_SUMS, passes=1)
+        if config.temporal:
+            steps = 2 * config.reprojection_iterations
+            whole += Cost(steps, steps, passes=1) + kernel
+        turn = Cost(taps, taps * (color_lookup(config.lookup) + 1), taps * TWO_SUMS, passes=1)
+        if config.blend_source == "filtered":
+            turn += Cost(taps, taps * color_lookup(config.lookup), passes=1)
+        return whole + turn * int(config.second_stage_iterations)
 
     def advance(
         self, samples: tuple[Frame, ...], history: History | None, values: Values

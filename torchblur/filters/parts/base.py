@@ -17,6 +17,7 @@ from torch import Tensor
 
 from torchblur.configured import ConfiguredModule, Values, batch_size_of
 from torchblur.errors import ConfigError
+from torchblur.filters.parts.cost import Cost
 from torchblur.filters.parts.registry import register_filter
 from torchblur.frame import LONGEST_SHUTTER, Frame, FrameSequence, Shutter, ShutterPosition
 from torchblur.ops.compiling import EngineChoice, compiler_works, worth_compiling
@@ -122,6 +123,20 @@ class BlurFilter(ConfiguredModule):
     def values_for(self, color: Tensor, overrides: dict[str, Any] | None = None) -> Values:
         """Return the values for one call, as the base does; a `Shutter` stands for two of them."""
         return super().values_for(color, with_shutter(overrides or {}))
+
+    @classmethod
+    def cost(cls, config: Any) -> Cost:
+        """Return what the filter costs per pixel; each filter counts.
+
+        Args:
+            config: Its configuration.
+
+        Raises:
+            ConfigError: the class does not say.
+        """
+        raise ConfigError(
+            f"the cost of `{cls.name}` is not known; give its class a method cost(config) -> Cost"
+        )
 
     def layers(self, frame: Frame, **overrides: Any) -> dict[str, Tensor]:
         """Return everything the filter computes, by name; "color" is the result.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Annotated, Literal
 
+from torchblur.filters.parts.cost import Cost, tiles
 from torchblur.filters.parts.places import PairNoise
 from torchblur.filters.parts.reach import REACH_MEANING, SPACING_MEANING
 from torchblur.filters.parts.reconstruction import GatherConfig
@@ -11,7 +12,7 @@ from torchblur.filters.parts.revealed import RevealedBackgroundConfig
 from torchblur.ops.directions import DirectionReduction
 from torchblur.params import Param
 
-__all__ = ["FrontBackConfig"]
+__all__ = ["FrontBackConfig", "motion_cost", "num_ways"]
 
 _OURS = "torchblur"
 _GUERTIN = "Guertin 2014"
@@ -143,3 +144,15 @@ class FrontBackConfig(RevealedBackgroundConfig, GatherConfig):
         meaning="gain of the foreground's alpha, before it is clamped",
     )] = 1.0
 # fmt: on
+
+
+def num_ways(config: FrontBackConfig) -> int:
+    """Return along how many directions taps lie; what is reversed counts as the same one."""
+    asked = (config.first_direction, config.own_direction, config.second_direction)
+    return max(sum(map(int, asked)), 1)
+
+
+def motion_cost(config: FrontBackConfig) -> Cost:
+    """Return what the tiles' motions cost, and what makes the motion at edges clean."""
+    found = tiles(config.tile_size, 3 if config.second_direction else 2)
+    return found if config.edge_motion == "own" else found + Cost(lookups=9, passes=1)

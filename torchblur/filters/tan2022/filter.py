@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from torchblur.filters.parts.base import Values
+from torchblur.filters.parts.cost import TWO_SUMS, Cost, gather, tiles
 from torchblur.filters.parts.reach import ReachingBlur, by_length
 from torchblur.filters.parts.reconstruction import (
     WEIGHT_PARAMETERS,
@@ -119,6 +120,15 @@ class Tan2022Blur(ReachingBlur):
     name = "tan2022"
     config_class = Tan2022Config
     _told: frozenset[str] = frozenset()
+
+    @classmethod
+    def cost(cls, config: Any) -> Cost:
+        """Return what it costs, counted from its configuration."""
+        ways = 2 if config.shutter_position == "centered" else 1
+        mask = Cost(config.mask_samples, config.mask_samples, passes=1) * ways
+        edges = Cost(lookups=9, passes=1)
+        layer = gather(config.num_samples, config.color_lookup, TWO_SUMS)
+        return edges + mask + (tiles(config.tile_size) + layer) * 2
 
     def compute(self, frame: Frame, values: Values) -> dict[str, Tensor]:
         """Return "color", the masks, the weights and the tiles."""

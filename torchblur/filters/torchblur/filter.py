@@ -8,8 +8,10 @@ import torch
 from torch import Tensor
 
 from torchblur.filters.parts.base import Values
+from torchblur.filters.parts.cost import WEIGHTS, Cost, color_lookup, with_background
 from torchblur.filters.parts.edges import clean_edges, half_spreads
 from torchblur.filters.parts.front_back import Blurred, Sums, compose, over_nothing, tap_inputs
+from torchblur.filters.parts.front_back_config import motion_cost, num_ways
 from torchblur.filters.parts.moving import moving_pixels, packed_values, tile_planes
 from torchblur.filters.parts.reach import ReachingBlur, by_length
 from torchblur.filters.parts.reconstruction import color_from, texture_of
@@ -83,6 +85,16 @@ class TorchblurBlur(ReachingBlur):
     name = "torchblur"
     published = False
     config_class = TorchblurConfig
+
+    @classmethod
+    def cost(cls, config: Any) -> Cost:
+        """Return what it costs, counted from its configuration."""
+        # At each time a sample of each direction, which is followed, and one on the pixel's line.
+        ways, taps = num_ways(config), config.num_samples
+        samples = taps * (ways + 1)
+        looks = samples * (color_lookup(config.color_lookup) + 1) + taps * ways * config.refinements
+        main = Cost(samples, looks, samples * WEIGHTS, passes=1)
+        return with_background(motion_cost(config) + main, config)
 
     def engine_for(self, pixels: float) -> Engine:
         """Return the engine that suits an amount of work: "auto" is the eager one.

@@ -10,6 +10,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from torchblur.filters.parts.base import BlurFilter, Values
+from torchblur.filters.parts.cost import TWO_SUMS, Cost
 from torchblur.filters.parts.revealed import layer_behind
 from torchblur.filters.warp.config import WarpConfig
 from torchblur.frame import Frame, Shutter
@@ -114,6 +115,14 @@ class WarpBlur(BlurFilter):
     name = "warp"
     published = False
     config_class = WarpConfig
+
+    @classmethod
+    def cost(cls, config: Any) -> Cost:
+        """Return what it costs, counted from its configuration."""
+        # The marks of all splats at all moments, four each, and what is made ready for them.
+        marks = 4 * config.num_samples * config.supersampling**2
+        ready = Cost(passes=4 if config.background == "none" else 10)
+        return ready + Cost(marks, marks, marks * TWO_SUMS, passes=1)
 
     def compute(self, frame: Frame, values: Values) -> dict[str, Tensor]:
         """Return "color", "coverage" and what lies behind."""
