@@ -1,4 +1,4 @@
-# make demo, make test, make lint, make bench: each sets up .venv by itself.
+# make demo, make test, make test-all, make lint, make bench: each sets up .venv by itself.
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
@@ -7,11 +7,11 @@ BIN := $(VENV)/bin
 FITS := guertin2014 mcguire2012 sousa2013 jimenez2014 notes2025 tan2022 torchblur warp stream \
         pareto-guertin2014 pareto-notes2025
 
-.PHONY: help demo test lint bench images presets clean
+.PHONY: help demo test test-all test-times lint bench images presets clean
 
 help:
 	@echo "make demo   tune Guertin's filter on procedural scenes; report in runs/demo/report.html"
-	@echo "make test   run the tests"
+	@echo "make test   run the quick tests; make test-all: all of them"
 	@echo "make lint   format, lint, types, import contracts"
 	@echo "make bench  time filters and memory (leave the machine alone meanwhile)"
 	@echo "make images the pictures of the README"
@@ -37,7 +37,14 @@ demo: $(VENV)/.tune
 
 # One torch thread per worker: two that share a core wait for each other.
 test: $(VENV)/.dev
-	OMP_NUM_THREADS=1 $(BIN)/pytest -n auto
+	OMP_NUM_THREADS=1 $(BIN)/pytest -n auto -m "not slow and not twin"
+
+test-all: $(VENV)/.dev
+	OMP_NUM_THREADS=1 TORCHBLUR_TEST_TIMES=1 $(BIN)/pytest -n auto
+
+# Measures all tests (leave the machine alone meanwhile) and writes down which take long.
+test-times: $(VENV)/.dev
+	OMP_NUM_THREADS=1 TORCHBLUR_WRITE_TIMES=tests/slow.txt $(BIN)/pytest -n auto
 
 lint: $(VENV)/.dev
 	$(BIN)/ruff format --check .

@@ -6,6 +6,8 @@ from pathlib import Path
 import pytest
 import torch
 
+pytest_plugins = ["tiers"]
+
 REPOSITORY = Path(__file__).resolve().parents[1]
 
 
