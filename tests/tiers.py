@@ -19,7 +19,7 @@ CALIBRATION = 0.033  # seconds that `_loop` takes there
 
 
 def pytest_collection_modifyitems(items):
-    listed = set(LIST.read_text().split()) if LIST.is_file() else set()
+    listed = set(LIST.read_text().splitlines()) if LIST.is_file() else set()
     for item in items:
         path = item.nodeid.split("::")[0]
         if path.startswith("tests/twins/"):

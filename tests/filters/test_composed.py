@@ -4,13 +4,13 @@ from torchblur.testing.contract import FilterContract
 ALTERNATE = {"sampling": "alternate", "resolve": "normalized"}
 PAIRS = {"sampling": "pairs"}
 RAMP = PAIRS | {"spread": "ramp"}
-GAPS = {"post_filter": True, "num_samples": 4, "shutter": 1.5}
 NOTES = RAMP | {
     "third_form": "none",
     "own_direction": False,
     "edge_motion": "own",
     "missing_background": "center",
 }
+GAPS = NOTES | {"post_filter": True, "num_samples": 4, "shutter": 1.5}
 BLEND = ALTERNATE | {"center_direction": "blend"}
 
 
@@ -62,13 +62,13 @@ class TestComposed(FilterContract):
         "alpha_combination": PAIRS,
         "accurate_alpha": PAIRS,
         "area_slope": PAIRS,
-        "missing_background": {"tile_size": 8},
-        "background_fade": {"tile_size": 8},
+        "missing_background": {"spread": "ramp", "third_form": "none"},
+        "background_fade": {"spread": "ramp", "third_form": "none"},
         **{f"post_{name}": GAPS for name in ("samples", "radius", "alpha", "acceptance")},
-        "post_filter": {"num_samples": 4, "shutter": 1.5},
+        "post_filter": NOTES | {"num_samples": 4, "shutter": 1.5},
         "post_threshold": GAPS,
-        "post_zero_alpha": GAPS | NOTES,
-        "post_edges": GAPS | NOTES,
+        "post_zero_alpha": GAPS,
+        "post_edges": GAPS | {"tap_spacing": 0.0},
         "post_tau": GAPS | {"post_acceptance": "soft"},
         "post_center_weight": GAPS,
     }

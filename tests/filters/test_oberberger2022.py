@@ -447,7 +447,7 @@ def test_bilinear_lookups_pass_a_gradient_to_the_steps(name):
 
 
 def test_filtering_all_pixels_gives_the_same_as_filtering_the_active_ones(monkeypatch):
-    import torchblur.filters.oberberger2022 as module
+    import torchblur.filters.oberberger2022.filter as module
 
     blur = Oberberger2022Blur(shutter=1.0)
     _, history = blur.step(SQUARE.stream(0))

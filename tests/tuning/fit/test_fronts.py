@@ -8,6 +8,7 @@ import torch
 from planted import write_planted
 
 from torchblur.errors import ConfigError
+from torchblur.filters import get_filter
 from torchblur.io import load_yaml, read_frame, save_yaml
 from torchblur.params import build
 from torchblur.presets import create_filter, load_preset
@@ -223,7 +224,7 @@ def test_mistakes_name_rule_value_and_place(tmp_path, monkeypatch, changes, mess
 @pytest.mark.parametrize("section", [{"methods": [{"kind": "pareto"}]}, {"objective": {"cost": 1}}])
 def test_a_filter_without_a_known_cost(tmp_path, monkeypatch, section):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("tuning.config.cost._TABLE", {})
+    monkeypatch.delattr(get_filter("guertin2014"), "cost")
     save_yaml("x.yaml", BASE | {"methods": [{"kind": "gradient", "free": ["kappa"]}]} | section)
     place = "methods.0.kind" if "methods" in section else "objective.cost"
     with pytest.raises(ConfigError, match=rf"cost of `guertin2014` is not known.*{place}"):

@@ -27,7 +27,7 @@ class ComposedConfig(FrontBackConfig, ReconstructionConfig):
     sampling: Annotated[Literal["alternate", "pairs"], Param(
         grad="discrete", source=f"alternate: {_GUERTIN}; pairs: {_JIMENEZ}",
         meaning="what a tap is: one direction by turns, or two sides of the pixel in each",
-    )] = "alternate"
+    )] = "pairs"
     num_samples: Annotated[int, Param(
         symbol="N", unit="taps", low=1, high=512, scale="log", grad="discrete", source=_OURS,
         meaning="taps: over all directions (alternate), or per direction (pairs, made even)",
