@@ -25,6 +25,7 @@ _HEIGHTS = (270, 540, 1080, 2160)
 _SHUTTERS = {"long": 0.3, "short": 0.03}
 """Half spreads of up to 17 px at 270 lines and 138 px at 2160; a tenth of that."""
 _RUNS = 3
+_LARGE = 1080  # lines from which one call is enough
 
 
 def main() -> None:
@@ -61,7 +62,7 @@ def cpu_seconds(name: str, frame: Frame, shutter: float) -> float:
         shutter: Open time in frames.
     """
     blur, taken = create_filter(name, engine="eager"), []
-    for _ in range(_RUNS if frame.size[0] < max(_HEIGHTS) else 1):
+    for _ in range(_RUNS if frame.size[0] < _LARGE else 1):
         start = time.process_time()
         blur(frame, shutter=shutter, shutter_position="centered")
         taken.append(time.process_time() - start)
@@ -78,7 +79,7 @@ def table(costs: dict[str, list[list[float]]]) -> str:
         "# Cost at four heights",
         "",
         "Made by `python -m tools.costs`: CPU-seconds of one eager call on one thread, median of",
-        f"{_RUNS} (one call at {max(_HEIGHTS)} lines); the whole image of crossing_spheres. Long /",
+        f"{_RUNS} (of one from {_LARGE} lines on); the whole image of crossing_spheres. Long and",
         "short: half spreads of up to 17 px at 270 lines, 35, 69 and 138 px at the others; and a",
         "tenth of that.",
         "",
