@@ -40,7 +40,7 @@ test: $(VENV)/.dev
 	OMP_NUM_THREADS=1 $(BIN)/pytest -n auto -m "not slow and not twin"
 
 test-all: $(VENV)/.dev
-	OMP_NUM_THREADS=1 TORCHBLUR_TEST_TIMES=1 $(BIN)/pytest -n auto
+	OMP_NUM_THREADS=1 $(BIN)/pytest -n auto
 
 # Measures all tests (leave the machine alone meanwhile) and writes down which take long.
 test-times: $(VENV)/.dev
