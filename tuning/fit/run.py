@@ -169,7 +169,7 @@ def _prepare(config: TuneConfig, folder: RunFolder, progress: Progress | None) -
 
 def _told(setting: _Setting) -> _Setting:
     """Tell what the user should know before the first trial."""
-    idle = without_effect(setting.problem, setting.space)
+    idle = without_effect(setting.problem, setting.space, setting.progress)
     notes = (*setting.notes, *map(_NO_EFFECT.format, idle))
     total = len(setting.cases)
     for note in notes:

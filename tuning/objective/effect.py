@@ -7,11 +7,14 @@ from typing import Any
 
 from tuning.objective.problem import Problem
 from tuning.objective.space import FreeParameter, Space
+from tuning.progress import Progress, Stage
 
 __all__ = ["without_effect"]
 
 
-def without_effect(problem: Problem, space: Space) -> tuple[str, ...]:
+def without_effect(
+    problem: Problem, space: Space, progress: Progress | None = None
+) -> tuple[str, ...]:
     """Return the parameters that change the objective of no window, whatever their value.
 
     Each is set to the ends of its range, or to each choice, with all others at their start. One
@@ -20,7 +23,9 @@ def without_effect(problem: Problem, space: Space) -> tuple[str, ...]:
     Args:
         problem: The objective.
         space: The parameters.
+        progress: Called after each parameter that is found to act.
     """
+    stage = Stage("what acts", len(space.parameters), progress)
     start = space.start()
     sets = {p.name: [start | {p.name: value} for value in _others(p)] for p in space.parameters}
     waiting = list(sets)
@@ -28,11 +33,10 @@ def without_effect(problem: Problem, space: Space) -> tuple[str, ...]:
         if not waiting:
             break
         here = float(problem.each(start, 1, [place]))
-        waiting = [
-            name
-            for name in waiting
-            if all(float(problem.each(values, 1, [place])) == here for values in sets[name])
-        ]
+        for name in tuple(waiting):
+            if any(float(problem.each(values, 1, [place])) != here for values in sets[name]):
+                waiting.remove(name)
+                stage.step(len(sets) - len(waiting), message=name)
     return tuple(waiting)
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Annotated, Literal
 
+from torchblur.filters.notes2025.config import PostFilterConfig
 from torchblur.filters.parts.front_back_config import FrontBackConfig
 from torchblur.filters.parts.reconstruction import ColorLookup, ReconstructionConfig
 from torchblur.ops.spread import Mirror, SpreadForm
@@ -17,10 +18,11 @@ _GUERTIN = "Guertin 2014"
 _JIMENEZ = "Jimenez 2014"
 _NOTES = "2025 notes"
 _BASE = declared(ReconstructionConfig)
+_POST = declared(PostFilterConfig)
 
 
 # fmt: off
-class ComposedConfig(FrontBackConfig, ReconstructionConfig):
+class ComposedConfig(PostFilterConfig, FrontBackConfig, ReconstructionConfig):
     """Parameters of the composed filter. `special_case` has the sets of the published ones."""
 
     # -- taps ----------------------------------------------------------------------------------
@@ -170,52 +172,5 @@ class ComposedConfig(FrontBackConfig, ReconstructionConfig):
     )] = 2.0
 
     # -- post-filter ---------------------------------------------------------------------------
-    post_filter: Annotated[bool, Param(
-        grad="discrete", source=_NOTES, meaning="second pass that fills the gaps between the taps",
-    )] = False
-    post_samples: Annotated[int, Param(
-        unit="taps", low=1, high=64, scale="log", grad="discrete", source=_NOTES,
-        active_when="post_filter == true",
-        meaning="most taps of the post-filter per direction, both sides",
-    )] = 6
-    post_radius: Annotated[float, Param(
-        low=0.05, high=2.0, grad="weak", source=_NOTES,
-        active_when="post_filter == true",
-        meaning="radius of the post-filter over the gap between two taps",
-    )] = 0.5
-    post_alpha: Annotated[Literal["foreground", "output"], Param(
-        grad="discrete", source=_NOTES,
-        active_when="post_filter == true",
-        meaning="alpha that the post-filter compares: the foreground's, or 1 where there is blur",
-    )] = "foreground"
-    post_acceptance: Annotated[Literal["hard", "soft"], Param(
-        grad="discrete", source=f"hard: {_NOTES}; soft: {_OURS}",
-        active_when="post_filter == true",
-        meaning="threshold on the difference of alphas, or a bell that has gradients",
-    )] = "hard"
-    post_threshold: Annotated[float, Param(
-        low=0.05, high=4.0, grad="weak", source=_NOTES,
-        active_when="post_acceptance == hard",
-        meaning="threshold on the difference of alphas, in steps of one tap per side (hard)",
-    )] = 1.0
-    post_tau: Annotated[float, Param(
-        low=0.05, high=4.0, grad="smooth", source=_OURS,
-        active_when="post_acceptance == soft",
-        meaning="width of the bell over the difference of alphas, in the same steps (soft)",
-    )] = 1.0
-    post_zero_alpha: Annotated[float, Param(
-        low=1e-6, high=0.5, grad="weak", source=f"0: {_NOTES}",
-        active_when="post_filter == true",
-        meaning="alpha up to which a pixel counts as neither moving nor blurred over",
-    )] = 1e-4
-    post_edges: Annotated[bool, Param(
-        grad="discrete", source=_NOTES,
-        active_when="post_filter == true",
-        meaning="at the outer edge of a blur take samples without alpha, too",
-    )] = True
-    post_center_weight: Annotated[float, Param(
-        low=0.01, high=8.0, scale="log", grad="smooth", source=_OURS,
-        active_when="post_filter == true",
-        meaning="weight of the pixel itself in the post-filter, in taps",
-    )] = 1.0
+    post_filter: Annotated[bool, _POST["post_filter"]] = False
 # fmt: on

@@ -46,7 +46,7 @@ def composed(frame: Frame, config: ComposedConfig | None = None, **params: Any) 
     The weight of a tap is depth × spread × direction, each in the forms that the texts have, plus
     the third weight of McGuire 2012 or Guertin 2014. Taps take one direction by turns (`sampling`
     "alternate") or lie in pairs on both sides of the pixel in each direction ("pairs"), and
-    `resolve` has three ways to make a color of the sums. `composed_cases.special_case` gives the
+    `resolve` has three ways to make a color of the sums. `composed.cases.special_case` gives the
     parameters with which this filter is a published one; what lies between them can be fitted.
 
     Args:

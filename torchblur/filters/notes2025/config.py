@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Annotated, Literal
 
+from torchblur.filters.parts.base import FilterConfig
 from torchblur.filters.parts.places import PairNoise
 from torchblur.filters.parts.reach import TILE_MEANING, ReachConfig
 from torchblur.filters.parts.revealed import RevealedBackgroundConfig
@@ -11,7 +12,7 @@ from torchblur.ops.directions import DirectionReduction
 from torchblur.ops.spread import Mirror, SpreadForm
 from torchblur.params import Param
 
-__all__ = ["Notes2025Config"]
+__all__ = ["Notes2025Config", "PostFilterConfig"]
 
 _BASE = "2025 notes, Baseline"
 _SUMS = "2025 notes, Separating Background/Foreground"
@@ -25,7 +26,62 @@ _CORNERS = "rounds the corners of the clamped weights, so that gradients pass th
 
 
 # fmt: off
-class Notes2025Config(RevealedBackgroundConfig, ReachConfig):
+class PostFilterConfig(FilterConfig):
+    """Parameters of the second pass, which fills the gaps between the taps."""
+
+    post_filter: Annotated[bool, Param(
+        grad="discrete", source=_POST, meaning="second pass that fills the gaps between the taps",
+    )] = True
+    post_samples: Annotated[int, Param(
+        unit="taps", low=1, high=64, scale="log", grad="discrete", source=_POST,
+        active_when="post_filter == true",
+        meaning="most taps of the post-filter per direction, both sides",
+    )] = 6
+    post_radius: Annotated[float, Param(
+        low=0.05, high=2.0, grad="weak", source=_POST,
+        active_when="post_filter == true",
+        meaning="radius of the post-filter over the gap between two taps",
+    )] = 0.5
+    post_alpha: Annotated[Literal["foreground", "output"], Param(
+        grad="discrete", source=f"foreground: {_POST}; output: {_HALF}",
+        active_when="post_filter == true",
+        meaning="alpha that the post-filter compares: the foreground's, or 1 where there is blur",
+    )] = "foreground"
+    post_acceptance: Annotated[Literal["hard", "soft"], Param(
+        grad="discrete", source=f"hard: {_POST}; soft: torchblur",
+        active_when="post_filter == true",
+        meaning="threshold on the difference of alphas, or a bell that has gradients",
+    )] = "hard"
+    post_threshold: Annotated[float, Param(
+        low=0.05, high=4.0, grad="weak", source=_POST,
+        active_when="post_acceptance == hard",
+        meaning="threshold on the difference of alphas, in steps of one tap per side (hard)",
+    )] = 1.0
+    post_tau: Annotated[float, Param(
+        low=0.05, high=4.0, grad="smooth", source="torchblur",
+        active_when="post_acceptance == soft",
+        meaning="width of the bell over the difference of alphas, in the same steps (soft)",
+    )] = 1.0
+    post_zero_alpha: Annotated[float, Param(
+        low=1e-6, high=0.5, grad="weak", source=f"0: {_POST}",
+        active_when="post_filter == true",
+        meaning="alpha up to which a pixel counts as neither moving nor blurred over",
+    )] = 1e-4
+    post_edges: Annotated[bool, Param(
+        grad="discrete", source=_POST,
+        active_when="post_filter == true",
+        meaning="at the outer edge of a blur take samples without alpha, too",
+    )] = True
+    post_center_weight: Annotated[float, Param(
+        low=0.01, high=8.0, scale="log", grad="smooth", source=f"torchblur ({_UNSTATED})",
+        active_when="post_filter == true",
+        meaning="weight of the pixel itself in the post-filter, in taps",
+    )] = 1.0
+# fmt: on
+
+
+# fmt: off
+class Notes2025Config(PostFilterConfig, RevealedBackgroundConfig, ReachConfig):
     """Parameters of the 2025 notes. The defaults are full resolution with all that it has.
 
     Where the text builds one direction it goes with ``depth_level=0.5`` and without direction
@@ -185,56 +241,6 @@ class Notes2025Config(RevealedBackgroundConfig, ReachConfig):
     alpha_gain: Annotated[float, Param(
         low=0.1, high=4.0, scale="log", grad="smooth", source="1 in the notes",
         meaning="gain of the foreground's alpha, before it is clamped",
-    )] = 1.0
-
-    # -- post-filter ---------------------------------------------------------------------------
-    post_filter: Annotated[bool, Param(
-        grad="discrete", source=_POST, meaning="second pass that fills the gaps between the taps",
-    )] = True
-    post_samples: Annotated[int, Param(
-        unit="taps", low=1, high=64, scale="log", grad="discrete", source=_POST,
-        active_when="post_filter == true",
-        meaning="most taps of the post-filter per direction, both sides",
-    )] = 6
-    post_radius: Annotated[float, Param(
-        low=0.05, high=2.0, grad="weak", source=_POST,
-        active_when="post_filter == true",
-        meaning="radius of the post-filter over the gap between two taps",
-    )] = 0.5
-    post_alpha: Annotated[Literal["foreground", "output"], Param(
-        grad="discrete", source=f"foreground: {_POST}; output: {_HALF}",
-        active_when="post_filter == true",
-        meaning="alpha that the post-filter compares: the foreground's, or 1 where there is blur",
-    )] = "foreground"
-    post_acceptance: Annotated[Literal["hard", "soft"], Param(
-        grad="discrete", source=f"hard: {_POST}; soft: torchblur",
-        active_when="post_filter == true",
-        meaning="threshold on the difference of alphas, or a bell that has gradients",
-    )] = "hard"
-    post_threshold: Annotated[float, Param(
-        low=0.05, high=4.0, grad="weak", source=_POST,
-        active_when="post_acceptance == hard",
-        meaning="threshold on the difference of alphas, in steps of one tap per side (hard)",
-    )] = 1.0
-    post_tau: Annotated[float, Param(
-        low=0.05, high=4.0, grad="smooth", source="torchblur",
-        active_when="post_acceptance == soft",
-        meaning="width of the bell over the difference of alphas, in the same steps (soft)",
-    )] = 1.0
-    post_zero_alpha: Annotated[float, Param(
-        low=1e-6, high=0.5, grad="weak", source=f"0: {_POST}",
-        active_when="post_filter == true",
-        meaning="alpha up to which a pixel counts as neither moving nor blurred over",
-    )] = 1e-4
-    post_edges: Annotated[bool, Param(
-        grad="discrete", source=_POST,
-        active_when="post_filter == true",
-        meaning="at the outer edge of a blur take samples without alpha, too",
-    )] = True
-    post_center_weight: Annotated[float, Param(
-        low=0.01, high=8.0, scale="log", grad="smooth", source=f"torchblur ({_UNSTATED})",
-        active_when="post_filter == true",
-        meaning="weight of the pixel itself in the post-filter, in taps",
     )] = 1.0
 
     # -- bilinear lookups ----------------------------------------------------------------------
