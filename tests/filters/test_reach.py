@@ -343,6 +343,21 @@ def test_post_filter_of_the_notes_closes_the_gaps_that_long_paths_have():
     assert not torch.allclose(denser, make("notes2025", num_samples=12, **shared)(frame), atol=1e-2)
 
 
+@pytest.mark.parametrize("acceptance", ["hard", "soft"])
+def test_its_threshold_is_that_of_the_taps_that_long_paths_have(acceptance):
+    # Alphas differ along the ends of the blur, so that the threshold decides.
+    shared = {"reach": "frame", "tile_size": 10, "center_weight": 0.0, "noise": "none"}
+    shared |= {"post_acceptance": acceptance, "post_radius": 2.0}
+    denser = make("notes2025", num_samples=12, tap_spacing=6.0, **shared)(passing())
+    asked = make("notes2025", num_samples=24, **shared)(passing())
+    assert torch.allclose(denser, asked, atol=1e-5)
+
+
+def test_the_default_keeps_its_spacing_up_to_its_longest_reach():
+    config = get_filter("torchblur")().config
+    assert 2 * config.max_reach / config.tap_spacing <= config.max_samples
+
+
 def test_second_pass_of_sousa_closes_the_gaps_that_long_paths_have():
     # Taps of the first pass are 12 px apart, with tap_spacing 6: the second spreads no farther.
     frame = constant_motion((240.0, 0.0), 4, 400)
