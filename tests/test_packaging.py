@@ -27,7 +27,10 @@ def test_the_wheel_has_types_and_version(repository, tmp_path):
     assert {"torchblur/py.typed", "tuning/py.typed"} <= set(names)
     templates = (repository / "tuning" / "report" / "templates").iterdir()
     assert {f"tuning/report/templates/{path.name}" for path in templates} <= set(names)
-    for folder in ("scenes", "families"):
-        scenes = (repository / "configs" / folder).glob("*.yaml")
-        assert {f"tuning/configs/{folder}/{path.name}" for path in scenes} <= set(names)
     assert not [name for name in names if name.startswith(("tests/", "configs/", "tools/"))]
+
+
+def test_nothing_but_packages_goes_into_the_wheel_by_force(repository):
+    # An editable install copies such files to a folder of that name, which hides the package.
+    project = tomllib.loads((repository / "pyproject.toml").read_text())
+    assert "force-include" not in project["tool"]["hatch"]["build"]["targets"]["wheel"]

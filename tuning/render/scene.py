@@ -23,7 +23,7 @@ from tuning.progress import Progress, Stage
 
 __all__ = ["RenderSettings", "find_scene", "render_sequence", "settings_of"]
 
-_ROOTS = (Path(), *Path(__file__).resolve().parents[1:3])  # a wheel has configs in the package
+_ROOTS = (Path(), Path(__file__).resolve().parents[2])
 
 
 class RenderSettings(Framed):
